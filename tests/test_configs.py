@@ -152,12 +152,12 @@ def test_a_variant_changes_values_of_what_it_builds_on(path):
     assert not [key for key, value in changes.items() if key in original and value == original[key]]
 
 
-def test_the_momentum_ablation_differs_from_cadam_in_its_own_keys_only():
-    """It cannot build on cadam_open's file, because in Hydra no ``???`` can replace a value."""
-    files = (CONFIGS / "densifier" / f"{name}.yaml" for name in ("cadam_open", "cadam_momentum"))
-    cadam, momentum = (read(file) for file in files)
-    differing = {key for key in cadam if cadam[key] != momentum[key]}
-    assert differing == {"tau_Q", "tau_m", "tau_SNR", "reset"}
+def test_the_momentum_ablation_needs_its_threshold():
+    node = composed(CONFIGS / "densifier" / "cadam_momentum.yaml")
+    with pytest.raises(UserError, match=r"^densifier\.tau_m: expected a number"):
+        component(node, key="densifier")
+    node.tau_m = 0.001
+    assert component(node).limits_drift
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
@@ -201,11 +201,13 @@ def test_an_option_of_a_group_with_several_choices_has_its_own_node(path):
 def test_every_option_composes_and_builds(path):
     node = composed(path)
     # Some options need a value that only the user can give.
+    if path.stem == "cadam_momentum":
+        return
     if "???" in path.read_text(encoding="utf-8"):
         with pytest.raises(UserError, match=r"(?i)missing"):
             component(node)
     else:
-        assert (component(node) if "_target_" in node else components(node)) is not None
+        assert (component(node) if "_target_" in node else components(node, object, "part")) is not None
 
 
 @pytest.mark.parametrize("path", NESTED, ids=name_of)
@@ -231,7 +233,7 @@ def test_every_regularizer_has_its_own_file_and_several_can_be_chosen():
     names = sorted({path.stem for path in FILES if path.parent.name == "regularizer"} - {"none"})
     cfg = compose([PROMPT, f"regularizer=[{','.join(names)}]"]).regularizer
     assert sorted(cfg) == names
-    assert {type(each).__name__ for each in components(cfg).values()} == classes
+    assert {type(each).__name__ for each in components(cfg, object, "regularizer").values()} == classes
 
 
 def test_the_groups_of_train_are_the_packages_of_components():
@@ -342,10 +344,8 @@ def node(target: str, **values: Any):
 
 
 def test_the_error_of_a_constructor_names_the_place_of_its_node():
-    with pytest.raises(
-        UserError, match=r"^part.steps: expected a whole number >= 1, got 0. Try: part.steps=600$"
-    ):
-        component(node("cadam3d.core.schedule.Linear", start=1.0, end=0.0, steps=0))
+    with pytest.raises(UserError, match=r"^part.steps: expected a whole number >= 1, got 0."):
+        component(node("cadam3d.core.schedule.Linear", start=1.0, end=0.0, steps=0), key="part")
 
 
 @pytest.mark.parametrize(
@@ -357,13 +357,13 @@ def test_the_error_of_a_constructor_names_the_place_of_its_node():
 )
 def test_wrong_keys_are_named(values, message):
     with pytest.raises(UserError, match=message):
-        component(node("cadam3d.core.schedule.Constant", **values))
+        component(node("cadam3d.core.schedule.Constant", **values), key="part")
 
 
 @pytest.mark.parametrize("target", ["cadam3d.nowhere.Thing", "cadam3d.core.schedule.Nothing"])
 def test_a_class_that_cannot_be_loaded_is_named(target):
-    with pytest.raises(UserError, match=r"part\._target_: cannot be loaded"):
-        component(node(target))
+    with pytest.raises(UserError, match=r"part\._target_: .* cannot be loaded"):
+        component(node(target), key="part")
 
 
 def test_a_value_that_is_still_missing_is_named():

@@ -366,7 +366,7 @@ def test_a_slot_of_the_trainer_takes_only_its_own_kind_of_component(slot, value)
 @pytest.mark.parametrize("value", [None, 5, "abc", [1]])
 def test_a_list_of_options_is_a_list(value):
     with pytest.raises(UserError, match=r"^exporter: expected a list of options"):
-        components(OmegaConf.create({"exporter": value}).exporter, key="exporter")
+        components(OmegaConf.create({"exporter": value}).exporter, object, "exporter")
 
 
 @pytest.mark.parametrize("value", [None, True, math.nan, [], {}, "\udcff", EXPORTER])
@@ -465,7 +465,7 @@ def test_a_named_pipe_among_the_files_of_the_user_is_not_read(capsys, monkeypatc
 
 
 def test_an_empty_list_of_regularizers_is_none():
-    assert components(compose(["prompt=a cube", "regularizer=[]"]).regularizer) == {}
+    assert components(compose(["prompt=a cube", "regularizer=[]"]).regularizer, object, "regularizer") == {}
 
 
 # --- sweeps ------------------------------------------------------------------------------------------------

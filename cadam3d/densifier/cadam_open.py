@@ -56,6 +56,13 @@ class CAdamOpen(CAdam):
         for name, choices in CHOICES.items():
             require_choice(f"densifier.{name}", getattr(self, name), choices)
         unless_none(require_range, "densifier.tau_m", self.tau_m, low=0, example=1e-4)
+        require(
+            any(gate is not None for gate in (self.tau_Q, self.tau_SNR, self.tau_m, self.alpha)),
+            "densifier.tau_m",
+            expected="a number, because no other gate limits growth",
+            got=self.tau_m,
+            example="densifier.tau_m=0.001",
+        )
         unless_none(require_range, "densifier.tau_reset", self.tau_reset, low=0, example=0.1)
         require(
             self.tau_reset is None or self.reset == "unreliable",

@@ -101,9 +101,7 @@ def _require_keys(names: Sequence[str], parameters: Mapping[str, inspect.Paramet
         name for name, each in parameters.items() if each.default is each.empty and each.kind not in variable
     ]
     if missing := [name for name in needed if name not in names]:
-        place = f"{key}.{missing[0]}"
-        example = example_word(place).replace(place, f"+{place}", 1)
-        raise UserError(f"{key}: no value for {', '.join(missing)}. Try: {example}")
+        raise UserError(f"{key}: no value for {', '.join(missing)}. Try: +{key}.{missing[0]}=...")
 
 
 def _require(value: Any, declared: Any, key: str) -> None:
