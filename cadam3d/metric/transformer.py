@@ -17,7 +17,7 @@ import torch
 from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json
-from cadam3d.io.pretrained import fetch_file
+from cadam3d.io.pretrained import fetch_file, short
 
 CONFIG = "config.json"
 WEIGHTS = "model.safetensors"
@@ -63,47 +63,35 @@ class TransformerSource:
         if missing:
             raise UserError(f"{self.key}: needs {', '.join(missing)}. Try: pip install 'cadam3d[diffusers]'")
         folder = Path(self.model).expanduser()
-        if folder.is_dir():
-            if not (folder / CONFIG).is_file():
-                raise self._missing(f"{self.model} has no {CONFIG}, so it is not a model of transformers")
-            return TransformerFolder(self, folder, None)
-        if not self._is_id:
-            raise self._missing(f"there is no folder {self.model!r}")
-        return self._downloaded()
-
-    @property
-    def _is_id(self) -> bool:
-        if Path(self.model).expanduser().exists():
-            return False
-        return self.model.count("/") == 1 and self.model[0] not in "./~" and self.model[-1] != "/"
-
-    def _downloaded(self) -> "TransformerFolder":
-        config, reason, can_ask = fetch_file(
-            self.model, CONFIG, self.revision, True, lacking="not a model of transformers"
-        )
-        if config is None:
-            raise self._missing(f"no model is available. {self.model}: {reason}")
-        try:
-            folder = _snapshot(self.model, self.revision, self.needed, can_ask)
-        # Also the errors of the hub, which are errors of the operating system.
-        except (OSError, ValueError) as error:
-            reason = " ".join(str(error).split())[:120]
-            raise self._missing(f"no model is available. {self.model}: {reason}") from error
+        if folder.exists() or self.model.count("/") != 1 or self.model[0] in "./~":
+            if (folder / CONFIG).is_file():
+                return TransformerFolder(self, folder, None)
+            reason = f"it has no {CONFIG}" if folder.is_dir() else "there is no folder of this name"
+            raise UserError(
+                f"{self.name}: expected a folder with a model of transformers, got {self.model!r} "
+                f"({reason}). Try: {self.name}=null"
+            )
+        folder = self._downloaded()
         # In the cache of the hub, the name of a snapshot is its commit.
         return TransformerFolder(self, folder, folder.name)
 
-    def _missing(self, problem: str) -> UserError:
-        """Return the error that says what to download, where to put it and what to type."""
-        if not self._is_id:
-            return UserError(f"{self.name}: {problem}. Try: {self.name}=null")
-        return UserError(f"{self.name}: {problem}. Try, with a network connection: {self.download()}")
-
-    def download(self) -> str:
-        """Return the line that downloads the model, and the setting that names its folder afterwards."""
+    def _downloaded(self) -> Path:
+        config, reason, can_ask = fetch_file(
+            self.model, CONFIG, self.revision, True, lacking="not a model of transformers"
+        )
+        try:
+            if config is not None:
+                return _snapshot(self.model, self.revision, self.needed, can_ask)
+        # Also the errors of the hub, which are errors of the operating system.
+        except (OSError, ValueError) as error:
+            reason = short(error)
         folder = f"models/{self.model.split('/')[1]}"
         revision = "" if self.revision is None else f"--revision {self.revision} "
         only = " ".join(f"--include '{pattern}'" for pattern in self.needed)
-        return f"hf download {self.model} {revision}--local-dir {folder} {only}. Then: {self.name}={folder}"
+        raise UserError(
+            f"{self.name}: no model is available. {self.model}: {reason}. Try, with a network connection: "
+            f"hf download {self.model} {revision}--local-dir {folder} {only}. Then: {self.name}={folder}"
+        )
 
 
 @dataclass(frozen=True)
@@ -116,10 +104,7 @@ class TransformerFolder:
 
     def config(self) -> dict[str, Any]:
         """Return the configuration of the model. Raises ``UserError`` if it cannot be read."""
-        entries = self._content(CONFIG)
-        if not isinstance(entries, dict):
-            raise self.damaged(f"{CONFIG} has no names with values")
-        return entries
+        return self._content(CONFIG)
 
     def check(self) -> None:
         """Raise ``UserError`` if a file is missing or incomplete. Only headers of weights are read."""
@@ -131,25 +116,20 @@ class TransformerFolder:
                 with safe_open(file, framework="pt"):
                     pass
             except (SafetensorError, OSError) as error:
-                raise self.damaged(f"{file.name} is incomplete or damaged ({error})") from error
+                raise self.damaged(f"{file.name} is incomplete or damaged ({short(error)})") from error
 
     def weights(self) -> list[Path]:
         """Return the files of the weights, in the order of their names.
 
         Raises ``UserError`` if there are none in the format of safetensors.
         """
-        single, index = self.folder / WEIGHTS, self.folder / SHARDS
-        if single.is_file():
-            return [single]
-        if not index.is_file():
-            raise self.damaged(f"it has no {WEIGHTS}, and no other format is read, since it could run code")
-        content = self._content(SHARDS)
-        shards = content.get("weight_map") if isinstance(content, dict) else None
-        names = sorted(set(shards.values())) if isinstance(shards, dict) else []
-        if not names or not all(isinstance(name, str) and Path(name).name == name for name in names):
-            raise self.damaged(f"{SHARDS} names no files")
-        if lacking := [name for name in names if not (self.folder / name).is_file()]:
-            raise self.damaged(f"{lacking[0]} is missing")
+        names = [WEIGHTS]
+        if not (self.folder / WEIGHTS).is_file() and (self.folder / SHARDS).is_file():
+            shards = self._content(SHARDS).get("weight_map", {})
+            names = sorted({str(name) for name in shards.values()})
+        for name in names:
+            if not (self.folder / name).is_file():
+                raise self.damaged(f"it has no {name}, and no other format is read, since it could run code")
         return [self.folder / name for name in names]
 
     def load(self, kind: Any, dtype: torch.dtype = torch.float32) -> Any:
@@ -196,18 +176,20 @@ class TransformerFolder:
         key, where = self.source.name, self.source.model
         return UserError(f"{key}: {where} cannot be used: {problem}. Try: another {key}")
 
-    def _content(self, name: str) -> Any:
+    def _content(self, name: str) -> dict[str, Any]:
         """Return the content of a JSON file of the model."""
         try:
-            return read_json(self.folder / name)
+            entries = read_json(self.folder / name)
         except UserError as error:
-            reason = str(error).partition(" Try: ")[0]
-            raise UserError(f"{self.source.name}: {reason} Try: download the model again") from error
+            raise self.damaged(str(error).partition(" Try: ")[0]) from error
+        if not isinstance(entries, dict):
+            raise self.damaged(f"{name} has no names with values")
+        return entries
 
     def _unreadable(self, what: str, error: Exception) -> BaseException:
         if isinstance(error, torch.OutOfMemoryError):
             return error
-        return self.damaged(f"its {what} cannot be loaded ({' '.join(str(error).split())[:200]})")
+        return self.damaged(f"its {what} cannot be loaded ({short(error)})")
 
 
 @cache  # every job of a sweep needs the model, and asking the hub takes time
