@@ -70,13 +70,6 @@ def test_a_folder_without_a_run_is_named(command, type_line, tmp_path):
         assert err.startswith(f"cadam3d: run: expected the folder of a run, got {place!r} ({reason}). Try: ")
 
 
-def test_the_message_for_a_run_without_an_asset_suggests_finishing_it(run_folder, type_line):
-    (run_folder / "asset.ply").unlink()
-    code, _, err = type_line("render", f"run={run_folder}")
-    assert code == 1
-    assert "has no asset.ply yet. Try: cadam3d train 'resume=a run'" in err
-
-
 def test_a_broken_file_is_one_message(type_line, tmp_path):
     (tmp_path / "broken.ply").write_bytes(b"ply\nnot really")
     code, _, err = type_line("render", "ply=broken.ply")
@@ -101,12 +94,6 @@ def test_render_accepts_a_file_and_an_output_folder(run_folder, type_line, tmp_p
     words = ("exporter=[images]", "exporter.images.size=16", "exporter.images.views=1")
     assert type_line("render", "ply=thing.ply", "output=some (pictures)", *words)[0] == 0
     assert len(list((tmp_path / "some (pictures)/images").iterdir())) == 1
-
-
-def test_the_message_of_render_without_an_exporter_suggests_some(run_folder, type_line):
-    code, _, err = type_line("render", f"run={run_folder}", "exporter=[]")
-    assert code == 1
-    assert "Try: 'exporter=[ply]'" in err
 
 
 TINY = ("exporter.images.size=8", "exporter.turntable.size=8", "exporter.turntable.views=4")
@@ -265,25 +252,9 @@ def test_eval_of_a_sweep_measures_every_job_and_reports_those_that_fail(tmp_path
     assert (sweep / "c/eval.json").is_file()
 
 
-def test_a_finished_run_without_an_asset_is_exported_by_the_line_of_the_message(tmp_path, type_line):
-    line = ("train", "prompt=a red cube", "steps=2", "camera.size=8", "initializer.count=20")
-    more = ("rasterizer=reference", "exporter=[]", "metric=[]", "hydra.run.dir=run", "callback=[checkpoint]")
-    assert type_line(*line, *more).code == 0
-    advice = type_line("eval", "run=run", *SMALL).message.rpartition("Try: cadam3d ")[2]
-    assert type_line(*shlex.split(advice)).code == 0
-    assert (tmp_path / "run/asset.ply").is_file()
-
-
 def test_eval_of_a_sweep_without_any_asset_fails(tmp_path, type_line):
     make_sweep(tmp_path / "sweep", "a")
     assert type_line("eval", "run=sweep")[0] == 1
-
-
-def test_other_commands_suggest_a_job_of_a_sweep(tmp_path, gaussians, type_line):
-    make_run(make_sweep(tmp_path / "sweep", "0_job") / "0_job", gaussians)
-    code, _, err = type_line("render", "run=sweep")
-    assert code == 1
-    assert "it is a sweep, which has many runs). Try: run=sweep/0_job" in err
 
 
 @pytest.mark.parametrize("has_display", [True, False])
@@ -297,12 +268,6 @@ def test_view_opens_its_address_if_there_is_a_display(run_folder, type_line, mon
     assert opened == out.splitlines()[:1] * has_display
     assert type_line("view", f"run={run_folder}", "open=false").code == 0
     assert len(opened) == has_display
-
-
-def test_view_of_a_run_that_has_nothing_to_show_suggests_finishing_it(run_folder, type_line):
-    (run_folder / "asset.ply").unlink()
-    message = type_line("view", f"run={run_folder}").message
-    assert message.endswith("has no asset.ply yet. Try: cadam3d train 'resume=a run'")
 
 
 def test_view_shows_the_report_of_a_sweep_and_writes_it_if_it_is_missing(tmp_path, type_line, monkeypatch):
@@ -334,36 +299,6 @@ def test_numbers_that_cannot_be_saved_are_printed(run_folder, type_line, monkeyp
         result = type_line("eval", f"run={place}", *SMALL)
         assert (result.code, result.message) == (1, "eval.json: cannot be written")
         assert printed in result.out
-
-
-@pytest.mark.parametrize("make", [lambda path: path.write_text("a file"), lambda path: path.mkdir()])
-def test_the_suggested_run_exists(make, type_line, tmp_path):
-    latest = tmp_path / "outputs/latest"
-    run_folder = tmp_path / "outputs/2026-11-22/a run"
-    (run_folder / ".hydra").mkdir(parents=True)
-    for name in ("config.yaml", ".hydra/overrides.yaml", "asset.ply"):
-        (run_folder / name).touch()
-    lines = (
-        *("train resume=outputs/latest", "view run=outputs/latest"),
-        *("render", "eval run=outputs/latest"),
-    )
-    for target in ("nowhere", "latest"):  # the second one is a circle
-        latest.unlink(missing_ok=True)
-        latest.symlink_to(target)
-        for line in lines:
-            check_suggestion(type_line(*line.split()).message, run_folder)
-    latest.unlink()
-    make(latest)
-    for line in lines:
-        check_suggestion(type_line(*line.split()).message, run_folder)
-    shutil.rmtree(run_folder)
-    for line in lines:
-        assert type_line(*line.split()).message.endswith('Try: cadam3d train prompt="a red torus"')
-
-
-def check_suggestion(message: str, run_folder: Path) -> None:
-    suggested = message.rpartition("Try: ")[2]
-    assert Path(shlex.split(suggested)[-1].partition("=")[2]).resolve() == run_folder
 
 
 def test_the_json_of_eval_is_strict(run_folder, type_line):
@@ -438,16 +373,3 @@ def test_runs_with_equal_densifiers_are_labelled_by_their_folders_and_equal_fold
 )
 def test_runs_that_cannot_be_compared_are_one_message(words, message, two_runs, type_line):
     assert type_line("render", *words).message.startswith(message)
-
-
-@pytest.mark.parametrize("command", ["export", "eval", "view"])
-def test_commands_for_one_run_refuse_several_and_suggest_to_compare_them(command, two_runs, type_line):
-    message = type_line(command, "run=[a x,b]").message
-    assert message.startswith("run: expected one run, got a list of 2, which only cadam3d render compares.")
-    assert message.endswith("Try: cadam3d render 'run=[a x,b]'")
-
-
-def test_a_comparison_of_files_that_are_no_pictures_is_refused(two_runs, type_line):
-    code, _, err = type_line("render", "run=[b,b]", "output=x.ply")
-    assert code == 1
-    assert "exporter.ply: it cannot show several assets side by side. Try: 'exporter=[preview" in err

@@ -1,7 +1,6 @@
 """Scores of models in the commands: train and eval record their methods, and tables never mix them."""
 
 import csv
-import shlex
 import shutil
 from pathlib import Path
 
@@ -100,14 +99,6 @@ def test_an_evaluation_keeps_what_others_have_measured(tmp_path, type_line, clip
     assert "measurements" not in read_json(run / "eval.json")
 
 
-def test_a_wrong_protocol_is_named_as_it_is_typed(tmp_path, type_line, clip):
-    make_run(tmp_path / "run")
-    message = type_line("eval", "run=run", "metric=[clip_score]", clip, "protocol.text=cat").message
-    assert message.startswith("protocol.text: ")
-    line = message.rpartition("Try: ")[2]
-    assert type_line("eval", "run=run", "metric=[clip_score]", clip, *SMALL, *shlex.split(line)).code == 0
-
-
 def test_training_measures_scores_too(tmp_path, type_line, clip):
     fast = ("steps=2", "camera.size=8", "rasterizer=reference", "exporter=[]", "callback=[]")
     line = ("train", "prompt=a red cube", "hydra.run.dir=run", "metric=[clip_score]", "initializer.count=20")
@@ -192,13 +183,6 @@ def test_values_texts_and_places_of_a_model_may_differ():
     # Without a hash, the name of a model is all that is known of it.
     nameless = [Score(1.0, record(weights_sha256=None, model=model)) for model in ("clip", "other")]
     assert "model is clip (1) and other (1)" in str(difference("n", nameless))
-
-
-def test_another_list_of_prompts_is_another_method():
-    scores = [Score(1.0, record(candidates_sha256=name)) for name in ("one", "two", "two")]
-    assert difference("r", scores) == (
-        "r was measured in different ways: candidates_sha256 is two (2) and one (1)"
-    )
 
 
 def test_an_evaluation_of_another_asset_is_not_used(tmp_path):

@@ -254,8 +254,6 @@ def test_a_text_of_consent_is_shown_as_text(arms, type_line, tmp_path):
         (("runs=[a,b]", "arms=x"), "arms: expected a list of texts or null, got 'x'. Try: arms=null"),
         (("runs=[a,b]", "backdrop=red"), "backdrop: expected a list of numbers, got 'red'. Try: 'backdrop="),
         (("runs=[a,a]",), "runs: expected the folder of a sweep, or a list of 2 to 12 different folders"),
-        (("a.json", "b.json"), "'a.json': expected key=value. Try: cadam3d study 'answers=[a.json,b.json]'"),
-        (("a", "b"), "'a': expected key=value. Try: cadam3d study 'runs=[a,b]'"),
     ],
 )
 def test_a_wrong_line_is_one_message(words, message, type_line):

@@ -158,26 +158,6 @@ def test_missing_files_are_reported_before_a_run(base, monkeypatch):
         metric(base=str(base)).prepare()
 
 
-def test_without_weights_one_line_says_what_to_download_and_what_to_type(base, monkeypatch):
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    text = refusal(base=str(base))
-    assert "hf download xswu/HPSv2 HPS_v2_compressed.pt --local-dir models" in text
-    assert text.endswith("Then: metric.hps.model=models/HPS_v2_compressed.pt")
-
-
-def test_without_a_base_one_line_says_what_to_download(monkeypatch):
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    text = refusal(base="laion/CLIP-ViT-H-14-laion2B-s32B-b79K")
-    assert text.startswith("metric.hps.base: ")
-    assert "hf download laion/CLIP-ViT-H-14-laion2B-s32B-b79K --local-dir models/CLIP-ViT-H-14" in text
-    assert "safetensors" not in text
-    assert text.endswith("Then: metric.hps.base=models/CLIP-ViT-H-14-laion2B-s32B-b79K")
-
-
-def test_a_missing_file_is_not_looked_for_on_the_hub(base):
-    assert "nothing there. Try: metric.hps.model=null" in refusal(base=str(base), model="models/HPS.pt")
-
-
 def test_a_file_with_other_weights_is_refused(tmp_path, weights, base):
     fewer = {name: tensor for name, tensor in weights.items() if name != "visual.proj"}
     assert "visual_projection" in refusal(model=str(checkpoint(tmp_path, fewer)), base=str(base))
@@ -194,9 +174,3 @@ def test_nothing_in_a_checkpoint_is_executed(tmp_path, base):
     torch.save({"state_dict": Trap()}, file)
     assert "is not a file of tensors" in refusal(model=str(file), base=str(base))
     assert not (tmp_path / "trapped").exists()
-
-
-@pytest.mark.parametrize(("key", "value"), [("version", "v3"), ("base", " ")])
-def test_wrong_settings_are_refused(key, value):
-    with pytest.raises(UserError, match=f"metric.hps.{key}: expected"):
-        metric(**{key: value})

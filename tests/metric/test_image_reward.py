@@ -129,25 +129,3 @@ def test_without_the_package_one_line_says_what_to_install(folder, monkeypatch):
     text = refusal(folder)
     assert text.startswith("metric.image_reward: the package image-reward cannot be imported")
     assert "Try, in a new environment: pip install 'cadam3d[image_reward]' openai-clip" in text
-
-
-def test_without_files_one_line_says_what_to_download_and_what_to_type(package, folder):
-    (folder / "med_config.json").unlink()
-    text = refusal(folder)
-    assert "med_config.json is missing" in text
-    assert "hf download THUDM/ImageReward ImageReward.pt med_config.json --local-dir models/Image" in text
-    assert text.endswith("Then: metric.image_reward.model=models/ImageReward")
-
-
-def test_an_error_of_the_package_becomes_one_line(package, folder, monkeypatch):
-    def fails(*arguments):
-        raise OSError("We couldn't connect\nto the hub")
-
-    monkeypatch.setattr(image_reward, "_loaded", fails)
-    monkeypatch.setattr(image_reward, "CACHE", folder / "empty")
-    assert "no model is available (We couldn't connect to the hub)" in refusal(None)
-
-
-def test_an_empty_folder_name_is_refused():
-    with pytest.raises(UserError, match="expected a folder or null"):
-        metric(" ")

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import Truth
 from cadam3d.metric import mesh
@@ -140,11 +139,3 @@ def test_hollows_that_cannot_be_reached_are_no_part_of_the_truth():
 
     [(vertices, _)] = true_surfaces(shell)
     assert np.linalg.norm(vertices, axis=1).min() > 0.55
-
-
-@pytest.mark.parametrize(
-    ("key", "value"), [("threshold", 0.0), ("samples", 1), ("seed", -1), ("level", 0.0), ("triangles", 3)]
-)
-def test_wrong_values_name_their_key(key, value):
-    with pytest.raises(UserError, match=rf"metric\.mesh\.{key}"):
-        MeshMetric(**{**SETTINGS, key: value})

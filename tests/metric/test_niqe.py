@@ -7,7 +7,6 @@ compute the numbers with our parameters, because those of basicsr do not come wi
 
 import hashlib
 import json
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -16,7 +15,6 @@ import pytest
 import torch
 from niqe_images import images
 from protocols import ring
-from scipy.special import gamma
 from splats import make_gaussians
 
 from cadam3d.core.errors import UserError
@@ -150,14 +148,6 @@ def test_views_without_texture_are_left_out_and_counted():
     assert "1 of 2 views" in measured.warnings[0]
 
 
-def test_the_best_view_needs_all_views():
-    chosen = replace(metric(), protocol=replace(protocol(), aggregation="best"))
-    picked = chosen.measure(showing(picture("chelsea as it is"), picture("chelsea noisy")))
-    values = picked.details["niqe"]["views"]
-    assert picked.numbers["niqe"] == min(values)
-    assert chosen.measure(showing(picture("chelsea as it is"), torch.ones(192, 192, 3))).numbers == {}
-
-
 def test_without_any_texture_there_is_no_number():
     assert metric().measure(showing(*[torch.ones(192, 192, 3)] * 2)).numbers == {}
 
@@ -193,25 +183,6 @@ def test_files_without_the_right_entries_are_refused(tmp_path, entries, reason):
         metric(parameters=str(file)).scorer(torch.device("cpu"))
 
 
-def test_a_file_that_is_no_archive_is_refused(tmp_path):
-    file = tmp_path / "other.npz"
-    file.write_bytes(b"no archive")
-    with pytest.raises(UserError, match=r"got .* \(it contains something other than numbers\)"):
-        metric(parameters=str(file)).scorer(torch.device("cpu"))
-
-
-def test_a_missing_file_is_reported():
-    with pytest.raises(UserError, match="No such file"):
-        metric(parameters="nowhere.npz").scorer(torch.device("cpu"))
-
-
 def test_small_views_are_refused():
     with pytest.raises(UserError, match=r"at least 192 pixels.*Try: protocol.size=512"):
         metric(size=128).scorer(torch.device("cpu"))
-
-
-def test_the_ratio_of_moments_identifies_the_shape():
-    # The fit looks a ratio up in this table, so it must be increasing.
-    assert (np.diff(natural.RATIOS) > 0).all()
-    gaussian = gamma(1.0) ** 2 / (gamma(0.5) * gamma(1.5))
-    assert gaussian == pytest.approx(np.interp(2, natural.SHAPES, natural.RATIOS))

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.render import RenderOutput, Truth
 from cadam3d.metric.base import Measurand
@@ -118,11 +117,3 @@ def test_without_true_outlines_there_are_no_numbers():
 
     assert measure(never, None) == {}
     assert measure(never, Truth(never)) == {}
-
-
-@pytest.mark.parametrize(
-    ("key", "value"), [("views", 0), ("elevations_deg", []), ("size", 0), ("background", [1.0])]
-)
-def test_wrong_values_name_their_key(key, value):
-    with pytest.raises(UserError, match=rf"metric\.outline\.{key}"):
-        Outline(**{**SETTINGS, key: value})

@@ -8,7 +8,7 @@ import torch
 from cadam3d.build import option
 from cadam3d.core.errors import UserError
 from cadam3d.core.render import RenderOutput
-from cadam3d.metric.protocol import ModelName, Protocol, RingProtocol, SphereProtocol
+from cadam3d.metric.protocol import Protocol, RingProtocol, SphereProtocol
 
 PICTURES = {
     "distance": 2.2,
@@ -56,16 +56,6 @@ def test_equal_values_stay_equal_and_the_best_field_of_view_counts():
     values[:, 2] = 2.0
     assert SPHERE.aggregate(values.flatten(), less_is_better=False) == pytest.approx(2.0)
     assert SPHERE.aggregate(values.flatten(), less_is_better=True) == pytest.approx(1.0)
-
-
-def test_one_lucky_place_is_averaged_with_its_neighbours():
-    values = torch.zeros(42, 3)
-    values[0] = 6.0
-    once = replace(SPHERE, rounds=1)
-    # A corner of the icosahedron has five neighbours.
-    assert once.aggregate(values.flatten(), less_is_better=False) == pytest.approx(1.0)
-    assert replace(SPHERE, rounds=0).aggregate(values.flatten(), less_is_better=False) == 6.0
-    assert 0 < SPHERE.aggregate(values.flatten(), less_is_better=False) < 1.0
 
 
 def test_smoothing_is_repeated_averages_over_neighbours():
@@ -119,16 +109,6 @@ def test_a_picture_without_an_object_is_not_cropped():
     assert all((images[..., 2] == 1).all() for images in replace(RING, crop="object").images(empty))
 
 
-def test_a_protocol_may_leave_a_model_out():
-    protocol = replace(RING, models={"clip": None, "pick": {"id": "one/pick", "revision": None}})
-    assert protocol.model("clip") is protocol.model("hps") is None
-    assert protocol.model("pick") == ModelName("one/pick", None)
-
-
-def test_the_prompt_goes_where_the_braces_are():
-    assert replace(RING, text="a photo of {}, 8k").text_of("a {cat}") == "a photo of a {cat}, 8k"
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -146,19 +126,6 @@ def test_the_prompt_goes_where_the_braces_are():
 def test_wrong_values_are_named(change, message):
     with pytest.raises(UserError, match=message):
         replace(RING, **change)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"subdivisions": 9}, "protocol.subdivisions"),
-        ({"other_fovs_y_deg": [180.0]}, "protocol.other_fovs_y_deg"),
-        ({"rounds": -1}, "protocol.rounds"),
-    ],
-)
-def test_wrong_values_of_a_sphere_are_named(change, message):
-    with pytest.raises(UserError, match=message):
-        replace(SPHERE, **change)
 
 
 @pytest.mark.parametrize(

@@ -156,17 +156,6 @@ def test_a_model_without_a_chat_template_needs_a_template(folder, tmp_path, shar
     metric(bare, template="<image>{}").measure(MEASURAND)
 
 
-def test_a_model_without_pictures_is_refused(clip_folder):
-    assert "cannot be used" in refusal(clip_folder)
-
-
-def test_without_the_model_one_line_says_what_to_download(monkeypatch):
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    text = refusal(None, model=None)
-    assert "hf download llava-hf/llava-1.5-7b-hf --local-dir models/llava-1.5-7b-hf" in text
-    assert text.endswith("Then: metric.vqa.model=models/llava-1.5-7b-hf")
-
-
 @pytest.mark.parametrize(
     ("key", "value"), [("question", "What is it?"), ("template", "<image>"), ("dtype", "int8")]
 )

@@ -6,10 +6,8 @@ from dataclasses import replace
 import pytest
 from raters import simulated_raters
 
-from cadam3d.core.errors import UserError
 from cadam3d.study.analysis import Analysis, analyse, screen
 from cadam3d.study.answers import Answer, Rater
-from cadam3d.study.questions import QUESTION_NAMES
 
 THREE = {"a": 1.0, "b": 0.0, "c": -1.0}
 
@@ -49,18 +47,6 @@ def test_a_clear_preference_is_certain_and_a_tie_is_not():
             assert (pair.first, pair.second) == ("baseline", "cadam")
             if is_certain:
                 assert pair.rate.interval.high < 0.5
-
-
-def test_questions_are_in_the_order_of_the_paper_and_unanswered_ones_are_left_out():
-    raters = simulated_raters({"a": 0, "b": 0}, 3, 3, questions=["overall", "cleanliness"])
-    assert [each.question for each in analyse(raters, least_caught=0.8).questions] == [
-        "cleanliness",
-        "overall",
-    ]
-    everything = simulated_raters({"a": 0, "b": 0}, 3, 3)
-    found = analyse(everything, least_caught=0.8)
-    assert tuple(each.question for each in found.questions) == QUESTION_NAMES
-    assert (found.raters, found.prompts, found.answers) == (3, 3, 45)
 
 
 def test_swapping_two_arms_mirrors_the_rates():
@@ -183,27 +169,6 @@ def test_arms_that_were_never_compared_have_no_comparison():
     raters = [rater("one", ("a", "b"), ("b", "c")), rater("two", ("b", "a"), ("c", "b"))]
     [result] = analyse(raters, least_caught=0.8).questions
     assert [(each.first, each.second) for each in result.comparisons] == [("a", "b"), ("b", "c")]
-
-
-@pytest.mark.parametrize(
-    ("raters", "example"),
-    [
-        ([], "cadam3d study --help"),
-        ([rater("r")], "cadam3d study --help"),
-        ([rater("r", ("a", "b"), catches=[False])], "least_caught=0"),
-    ],
-)
-def test_a_study_without_usable_answers_is_refused(raters, example):
-    with pytest.raises(
-        UserError, match=rf"answers: expected answers of at least one rater .* Try: {example}$"
-    ):
-        analyse(raters, least_caught=0.8)
-
-
-@pytest.mark.parametrize("least", [-0.1, 1.1, float("nan"), True])
-def test_the_share_of_right_catches_is_checked(least):
-    with pytest.raises(UserError, match="least_caught"):
-        analyse(simulated_raters({"a": 0, "b": 0}, 2, 2), least_caught=least)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 4), (4, 1), (5, 4)])

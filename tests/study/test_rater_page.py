@@ -224,25 +224,6 @@ def test_answers_that_the_browser_cannot_keep_are_not_closed_without_a_question(
     assert asked == ["beforeunload"]
 
 
-def test_the_start_needs_a_name_and_consent(visit):
-    page = visit()
-    page.keyboard.press("Enter")
-    assert page.is_visible("#start")
-    page.keyboard.type("   ")
-    page.keyboard.press("Tab")
-    page.keyboard.press("Space")
-    page.keyboard.press("Enter")
-    assert page.is_visible("#start")
-
-
-def test_a_key_that_is_held_answers_one_question(visit):
-    page = visit()
-    begin(page, "1")
-    for _ in range(4):  # without a release, all but the first are repeats
-        page.keyboard.down("ArrowLeft")
-    assert place_of(page) == "Pair 1 of 3 · question 2 of 5"
-
-
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (360, 640), (844, 390), (1366, 768)])
 def test_both_objects_and_both_buttons_fit_on_the_screen(visit, width, height):
     page = visit()
