@@ -19,6 +19,7 @@ from cadam3d.io.asset_record import sha256_of
 from cadam3d.io.atomic import replacing
 from cadam3d.io.caption import plain
 from cadam3d.io.jsonl import write_json
+from cadam3d.io.prompt_files import read_prompts
 from cadam3d.io.reading import read_text
 from cadam3d.io.run_folder import (
     ASSET,
@@ -45,7 +46,7 @@ from cadam3d.study.answers import (
 from cadam3d.study.clips import LEAST_VISIBLE, ClipSettings, FilmedTurn, film, ruined
 from cadam3d.study.key import KEY, PAGE, RESULTS, TABLE, Key, read_key, write_key
 from cadam3d.study.rater_page import study_id, study_page
-from cadam3d.study.runs import Found, RunPair, StudyRun, draw_pairs, find_runs, pair_runs, select
+from cadam3d.study.runs import RunPair, StudyRun, draw_pairs, find_runs, pair_runs, select
 from cadam3d.study.trials import StudyPlan, catch_count, make_plan
 
 LARGEST_PAGE = 100_000_000  # bytes; above this, some mail servers and phones refuse a page
@@ -74,7 +75,8 @@ def run(cfg: DictConfig, _call: Call) -> None:
 def _write(cfg: DictConfig) -> None:
     """Write ``study.html`` and ``key.json`` into ``output``, and print what they contain."""
     settings = _settings(cfg)
-    consent = _consent(cfg.consent)
+    # The text that raters read before they begin.
+    consent = CONSENT if cfg.consent is None else read_text(expanded(cfg.consent), largest=LARGEST_CONSENT)
     pairs = _pairs(cfg)
     generator = _generator(cfg.seed, pairs)
     pairs = draw_pairs(pairs, cfg.pairs, generator)
@@ -90,7 +92,7 @@ def _write(cfg: DictConfig) -> None:
         with replacing(folder / PAGE) as temporary:
             temporary.write_text(page, encoding="utf-8")
         write_key(folder / KEY, study, plan, seed=cfg.seed)
-        _print_page(folder, pairs, plan, settings)
+        _print_page(folder, pairs, plan)
 
 
 def _settings(cfg: DictConfig) -> ClipSettings:
@@ -110,17 +112,6 @@ def _settings(cfg: DictConfig) -> ClipSettings:
     )
 
 
-def _consent(path: str | None) -> str:
-    """Return the text that raters read before they begin."""
-    if path is None:
-        return CONSENT
-    try:
-        return read_text(expanded(path), largest=LARGEST_CONSENT)
-    except UserError as error:
-        reason = str(error).partition(". Try: ")[0]
-        raise UserError(f"consent: expected a text file, got {reason}. Try: consent=null") from error
-
-
 def _generator(seed: int, pairs: Sequence[RunPair]) -> Random:
     """Return what draws the order, the sides and the numbers of the clips.
 
@@ -135,29 +126,15 @@ def _generator(seed: int, pairs: Sequence[RunPair]) -> Random:
 def _pairs(cfg: DictConfig) -> list[RunPair]:
     """Return all pairs of runs, and print a note if runs are left out."""
     found = find_runs(_texts(cfg.runs), None if cfg.labels is None else _texts(cfg.labels))
-    runs = select(found.runs, None if cfg.arms is None else _texts(cfg.arms), _prompts(cfg.prompts))
+    prompts = None if cfg.prompts is None else {each.text for each in read_prompts(str(cfg.prompts))}
+    runs = select(found.runs, None if cfg.arms is None else _texts(cfg.arms), prompts)
     pairs = pair_runs(runs, same_seed=cfg.same_seed)
-    _note_left(found, runs, pairs)
-    return pairs
-
-
-def _prompts(source: str | None) -> set[str] | None:
-    """Return the texts of the prompts that ``prompts=`` names; None for all."""
-    if source is None:
-        return None
-    from cadam3d.io.prompt_files import read_prompts
-
-    return {prompt.text for prompt in read_prompts(str(source))}
-
-
-def _note_left(found: Found, runs: Sequence[StudyRun], pairs: Sequence[RunPair]) -> None:
     if found.without_asset:
         note(f"{plural(found.without_asset, 'run')} left no asset and cannot be shown")
-    single = [run for run in runs if not any(run in pair.runs for pair in pairs)]
-    if single:
-        some = ", ".join(str(shown(run.folder)) for run in single[:3])
-        more = ", ..." if len(single) > 3 else ""
-        note(f"{plural(len(single), 'run')} without a partner in another arm: {some}{more}")
+    paired = {run for pair in pairs for run in pair.runs}
+    if single := [str(shown(run.folder)) for run in runs if run not in paired]:
+        note(f"{plural(len(single), 'run')} without a partner in another arm, such as {single[0]}")
+    return pairs
 
 
 @contextmanager
@@ -171,14 +148,10 @@ def _output(cfg: DictConfig) -> Iterator[Path]:
     free = setting_word("output", shown(numbered(folder.with_name(folder.name or "study"))))
     if not text.strip() or folder.parent == folder:
         raise UserError(f"output: expected a folder, got {text!r}. Try: output=study")
-    if folder.is_dir() and (name := occupant(folder)):
-        raise UserError(f"output: expected a folder of its own, got one with {name}. Try: {free}")
-    if os.path.lexists(folder / KEY):
-        # Without its key, the answers to a study are lost.
-        raise UserError(
-            f"output: expected a folder without a study, got {shown(folder)}, which has the key of one. "
-            f"Try: {free}"
-        )
+    # Without its key, the answers to a study are lost.
+    found = KEY if os.path.lexists(folder / KEY) else occupant(folder) if folder.is_dir() else None
+    if found:
+        raise UserError(f"output: expected a folder of its own, got one with {found}. Try: {free}")
     existing = nearest_existing(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -219,7 +192,7 @@ def _plan(
     return make_plan(pairs, visible, catches, generator)
 
 
-def _print_page(folder: Path, pairs: Sequence[RunPair], plan: StudyPlan, settings: ClipSettings) -> None:
+def _print_page(folder: Path, pairs: Sequence[RunPair], plan: StudyPlan) -> None:
     met = Counter(pair.arms for pair in pairs)
     for (one, other), count in sorted(met.items()):
         print(f"{one} and {other}: {plural(count, 'pair')}")
@@ -231,11 +204,7 @@ def _print_page(folder: Path, pairs: Sequence[RunPair], plan: StudyPlan, setting
     print(f"for the raters:  {shown(folder / PAGE)}")
     print(f"keep it secret:  {shown(folder / KEY)}")
     if size > LARGEST_PAGE:
-        note(
-            f"the page has {size / 1e6:.0f} MB. To make it smaller, add "
-            f"size={max(1, settings.size * 2 // 3)}, frames={max(1, settings.frames * 2 // 3)} or "
-            f"pairs={max(1, len(pairs) // 2)}"
-        )
+        note(f"the page is {size / 1e6:.0f} MB. To make it smaller, reduce size, frames or pairs")
 
 
 # The answers.

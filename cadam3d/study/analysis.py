@@ -146,14 +146,20 @@ def analyse(raters: Sequence[Rater], *, least_caught: float) -> Analysis:
     kept = {rater.name for rater in screening.kept}
     answers = [answer for rater in raters if rater.name in kept for answer in rater.answers]
     if not answers:
-        # Some raters may have answered catch trials only.
-        example = "least_caught=0" if any(rater.answers for rater in raters) else "cadam3d study --help"
         raise UserError(
             "answers: expected answers of at least one rater who passes the catch trials, got none "
-            f"(raters who failed: {len(screening.excluded)} of {len(raters)}). Try: {example}"
+            f"(raters who failed: {len(screening.excluded)} of {len(raters)}). Try: least_caught=0"
         )
     by_question = [[each for each in answers if each.question == name] for name in QUESTION_NAMES]
-    results = _corrected([question_result(each) for each in by_question if each])
+    results = [question_result(each) for each in by_question if each]
+    p_values = iter(holm([each.p_value for result in results for each in result.comparisons]))
+    results = [
+        replace(
+            result,
+            comparisons=tuple(replace(each, corrected_p_value=next(p_values)) for each in result.comparisons),
+        )
+        for result in results
+    ]
     return Analysis(
         arms=_arms(answers),
         raters=len({answer.rater for answer in answers}),
@@ -170,23 +176,15 @@ def screen(raters: Sequence[Rater], least: float) -> Screening:
 
     ``least`` is the share of the answers in catch trials that must be right, in [0, 1].
     """
-    screened = []
+    kept, excluded = [], []
     for rater in sorted(raters, key=lambda rater: rater.name):
         right, total = sum(rater.catches), len(rater.catches)
+        needed = math.ceil(total * least - 1e-9)
         # Half of the guesses are right on average.
-        by_chance = float(binom.sf(_needed(total, least) - 1, total, EVEN))
-        screened.append(Screened(rater.name, right, total, by_chance))
-    passed = [each.right >= _needed(each.total, least) for each in screened]
-    return Screening(
-        least,
-        kept=tuple(each for each, passes in zip(screened, passed, strict=True) if passes),
-        excluded=tuple(each for each, passes in zip(screened, passed, strict=True) if not passes),
-    )
-
-
-def _needed(total: int, least: float) -> int:
-    """Return how many of ``total`` catch trials must be right."""
-    return math.ceil(total * least - 1e-9)
+        by_chance = float(binom.sf(needed - 1, total, EVEN))
+        passed = kept if right >= needed else excluded
+        passed.append(Screened(rater.name, right, total, by_chance))
+    return Screening(least, tuple(kept), tuple(excluded))
 
 
 def question_result(answers: Sequence[Answer]) -> QuestionResult:
@@ -266,24 +264,7 @@ def _ranking(arms: Sequence[str], answers: Sequence[Answer]) -> Ranking:
     values = fit_strengths(wins)
     margins = strength_margins(chosen, other, _clusters(answers), values)
     strengths = [
-        Strength(arm, float(value), float(expit(value)), _around(float(value), float(half)))
+        Strength(arm, float(value), float(expit(value)), Interval.around(float(value), float(half)))
         for arm, value, half in zip(arms, values, margins, strict=True)
     ]
     return Ranking(tuple(sorted(strengths, key=lambda each: (-each.log_odds, each.arm))), None)
-
-
-def _around(log_odds: float, half: float) -> Interval:
-    """Return the probabilities ``half`` below and above ``log_odds``."""
-    return Interval(float(expit(log_odds - half)), float(expit(log_odds + half)))
-
-
-def _corrected(results: Sequence[QuestionResult]) -> list[QuestionResult]:
-    """Return the results with p-values corrected for the number of comparisons of all questions."""
-    p_values = iter(holm([each.p_value for result in results for each in result.comparisons]))
-    return [
-        replace(
-            result,
-            comparisons=tuple(replace(each, corrected_p_value=next(p_values)) for each in result.comparisons),
-        )
-        for result in results
-    ]

@@ -28,6 +28,11 @@ class Interval:
     low: float
     high: float
 
+    @classmethod
+    def around(cls, log_odds: float, half: float) -> "Interval":
+        """Return the probabilities ``half`` below and above ``log_odds``."""
+        return cls(float(expit(log_odds - half)), float(expit(log_odds + half)))
+
     def excludes(self, value: float) -> bool:
         """Return whether ``value`` is outside."""
         return not self.low <= value <= self.high
@@ -107,8 +112,7 @@ def rate_interval(chosen: Bool[np.ndarray, "n"], clusters: Clusters) -> Interval
     if share == 0:
         return Interval(0.0, 1 - _unanimous(clusters))
     half = margin((chosen - share) / (len(chosen) * share * (1 - share)), clusters)
-    center = float(logit(share))
-    return Interval(float(expit(center - half)), float(expit(center + half)))
+    return Interval.around(float(logit(share)), half)
 
 
 def _unanimous(clusters: Clusters) -> float:

@@ -211,7 +211,7 @@ def test_a_folder_with_a_key_is_not_written_again(arms, type_line, tmp_path):
     type_line("study", arms, *SMALL)
     before = (tmp_path / "study/key.json").read_bytes()
     message = type_line("study", arms, *SMALL, "seed=1").message
-    assert message.startswith("output: expected a folder without a study")
+    assert message.startswith("output: expected a folder of its own, got one with key.json")
     assert message.endswith("Try: output=study-2")
     assert (tmp_path / "study/key.json").read_bytes() == before
 
