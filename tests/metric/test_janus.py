@@ -12,12 +12,12 @@ from cadam3d.build import component, components
 from cadam3d.core.cameras import turntable
 from cadam3d.core.gaussians import Gaussians, concatenate
 from cadam3d.core.render import RenderOutput, Truth
-from cadam3d.metric.base import Measurand, Measurement
+from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.janus import VIEWS, Janus
 from cadam3d.metric.scoring import Scorer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
-SETTINGS = dict(components(composed("prompt=a", "metric=[janus]").metric, key="metric"))
+SETTINGS = dict(components(composed("prompt=a", "metric=[janus]").metric, Metric, key="metric"))
 ONE = make_gaussians(1)
 
 
