@@ -27,7 +27,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-from checkouts import HERE, add_base, environment_of, find_trees
+from measuring import HERE, add_base, environment_of, find_trees
 
 # Each Gaussian touches this many tiles in each view.
 TILES = 16

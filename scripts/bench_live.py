@@ -7,13 +7,12 @@ step, a look for requests and for an open page, and a snapshot for an open page.
 second and writes one snapshot a second, or fewer if these would take more than their share.
 """
 
-import argparse
 import statistics
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 
+import measuring
 import torch
 
 from cadam3d.build import build_trainer, component
@@ -31,17 +30,13 @@ LOOKS = 1 / callback.LOOK_SECONDS  # per second
 
 def milliseconds(work: Callable[[], object], times: int, repeats: int) -> float:
     """Return the median CPU time of ``work``, over ``repeats`` measurements of ``times`` calls."""
-    measured = []
-    for _ in range(repeats + 1):
-        began = time.process_time()
-        for _ in range(times):
-            work()
-        measured.append(1000 * (time.process_time() - began) / times)
+    device = torch.device("cpu")
+    measured = [measuring.milliseconds(work, device, times) for _ in range(repeats + 1)]
     return statistics.median(measured[1:])
 
 
-def measure(count: int, share: float, folder: Path, device: torch.device) -> str:
-    """Return one line of the table."""
+def measure(count: int, share: float, folder: Path, device: torch.device) -> dict[str, str]:
+    """Return one row of the table."""
     words = ["prompt=a snowman next to a pine", f"initializer.count={count}", "callback=[]"]
     cfg = compose([*words, "steps=1000000", "refine.start=900000"])
     trainer = build_trainer(cfg, device)
@@ -76,31 +71,31 @@ def measure(count: int, share: float, folder: Path, device: torch.device) -> str
     size = (folder / "live/snapshot.bin").stat().st_size
     callback.LOOK_SECONDS = control.LOOK_SECONDS = 1 / LOOKS
     every = max(1.0, shown / 1000 / share)
-    cells = [
-        f"{count:,}",
-        f"{step:.1f}",
-        f"{closed:.3%}",
-        f"{shown:.1f}",
-        f"{size / 1e6:.2f}",
-        f"{every:.1f}",
-    ]
-    return f"| {' | '.join(cells)} | {shown / 1000 / every:.1%} |"
+    return {
+        "Gaussians": f"{count:,}",
+        "step, ms": f"{step:.1f}",
+        "no page": f"{closed:.3%}",
+        "snapshot, ms": f"{shown:.1f}",
+        "MB": f"{size / 1e6:.2f}",
+        "seconds between": f"{every:.1f}",
+        "open page": f"{shown / 1000 / every:.1%}",
+    }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    parser = measuring.parser_of(__doc__)
+    parser.add_argument(
+        "--counts", type=measuring.positive, nargs="+", default=[4000, 50000], help="Gaussians"
     )
-    parser.add_argument("--counts", type=int, nargs="+", default=[4000, 50000], help="Gaussians")
     options = parser.parse_args()
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     share = compose(["prompt=a red cube"]).callback.live.share
     torch.set_num_threads(1)
-    print("| Gaussians | step, ms | no page | snapshot, ms | MB | seconds between | open page |")
-    print("|---|---|---|---|---|---|---|")
+    rows = []
     for count in options.counts:
         with tempfile.TemporaryDirectory() as folder:
-            print(measure(count, share, Path(folder), device), flush=True)
+            rows.append(measure(count, share, Path(folder), device))
+    print(measuring.table(rows))
 
 
 if __name__ == "__main__":

@@ -7,11 +7,11 @@ The settings are those of configs/exporter/mesh.yaml and configs/metric/mesh.yam
 the exporter on one thread, writing the glb included. The prompt is read from the run.
 """
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
 
+import measuring
 import torch
 from omegaconf import OmegaConf
 from torch import Tensor
@@ -28,15 +28,13 @@ from cadam3d.metric.mesh import MeshMetric, distances_between, f_score, true_sur
 from cadam3d.prior.shapes.scene import build, signed_distance
 from cadam3d.settings.compose import compose
 
-HEADER = "| prompt | triangles | parts | watertight | Chamfer | F at 0.01 | F at 0.02 | seconds |"
-
 
 def no_pictures(cameras: Cameras, background: Tensor, shown: Gaussians | None = None) -> RenderOutput:
     """Refuse to render, because a mesh needs no picture."""
     raise AssertionError("the exporter of meshes renders nothing")
 
 
-def measure(run: Path, exporter: Exporter, metric: MeshMetric) -> str:
+def measure(run: Path, exporter: Exporter, metric: MeshMetric) -> dict[str, object]:
     """Return the row of the table for one run."""
     prompt = OmegaConf.load(run / CONFIG).prompt
     gaussians = read_ply(run / ASSET)
@@ -52,26 +50,28 @@ def measure(run: Path, exporter: Exporter, metric: MeshMetric) -> str:
         (surface.vertices, surface.faces), truth, metric.samples, metric.seed
     )
     chamfer = (to_true.mean() + to_mesh.mean()) / 2
-    scores = [f"{f_score(to_true, to_mesh, limit)[0]:.3f}" for limit in (0.01, 0.02)]
-    closed = "yes" if facts.watertight else "no"
-    cells = [prompt, facts.triangles, facts.parts, closed, f"{chamfer:.4f}", *scores, f"{seconds:.1f}"]
-    return f"| {' | '.join(map(str, cells))} |"
+    return {
+        "prompt": prompt,
+        "triangles": facts.triangles,
+        "parts": facts.parts,
+        "watertight": "yes" if facts.watertight else "no",
+        "Chamfer": f"{chamfer:.4f}",
+        "F at 0.01": f"{f_score(to_true, to_mesh, 0.01)[0]:.3f}",
+        "F at 0.02": f"{f_score(to_true, to_mesh, 0.02)[0]:.3f}",
+        "seconds": f"{seconds:.1f}",
+    }
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = measuring.parser_of(__doc__)
     parser.add_argument("runs", nargs="+", type=Path, help="folders of runs with prior=shapes")
     runs = parser.parse_args().runs
     torch.set_num_threads(1)
     cfg = compose(["prompt=a cube", "exporter=[mesh]", "metric=[mesh]"])
     exporter = component(cfg.exporter.mesh, Exporter, "exporter.mesh")
     metric = component(cfg.metric.mesh, MeshMetric, "metric.mesh")
-    print(f"{HEADER}\n|---|---|---|---|---|---|---|---|")
-    for run in runs:
-        print(measure(run, exporter, metric), flush=True)
+    print(measuring.table([measure(run, exporter, metric) for run in runs]))
 
 
 if __name__ == "__main__":

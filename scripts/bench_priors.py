@@ -10,13 +10,12 @@ An object has the right colour if its error is at most 20 (CIE Lab, delta E 76),
 silhouettes overlap by at least 0.7 (IoU at the best turn). The gain is over the initial Gaussians of the run.
 """
 
-import argparse
 import statistics
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import trained_runs
+import measuring
 
 PRIORS = ("shapes_sd", "shapes_mvdream", "shapes_sd3")
 PROMPTS = (
@@ -64,20 +63,18 @@ def verdict(results: Sequence[Summary]) -> str:
 
 
 def main(line: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = measuring.parser_of(__doc__)
     parser.add_argument("--prior", required=True, choices=PRIORS)
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
     parser.add_argument("--prompts", nargs="+", default=PROMPTS)
     arguments, settings = parser.parse_known_args(line)
     results = []
-    print(trained_runs.header(COLUMNS))
+    print(measuring.header(COLUMNS))
     for prompt in arguments.prompts:
-        folder = arguments.out / arguments.prior / trained_runs.folder_name(prompt, settings)
+        folder = arguments.out / arguments.prior / measuring.folder_name(prompt, settings)
         words = [f"prior={arguments.prior}", f"prompt={prompt}", *SETTINGS, *settings]
-        results.append(trained_runs.result(folder, words))
-        print(trained_runs.line_of([show(results[-1]) for show in COLUMNS.values()]), flush=True)
+        results.append(measuring.trained(folder, words))
+        print(measuring.line_of([show(results[-1]) for show in COLUMNS.values()]), flush=True)
     print(f"\n{verdict(results)}")
 
 

@@ -4,17 +4,18 @@
     python scripts/bench_rasterizer.py --device cuda    # this GPU: cuda, stage by stage, beside gsplat
 
 A backend that disagrees with the reference, or with itself from run to run, is not timed. The script prints
-the differences, times the other backends, and ends with exit code 1. Times are medians in milliseconds, and
-`best` is the shortest time. The ratio is the time of the first backend divided by that of the row's backend.
+the differences, times the other backends, and ends with exit code 1. Times are medians in milliseconds. The
+ratio is the time of a step of the first backend divided by that of the row's backend.
 docs/notes/performance.md describes the measurement.
 """
 
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from itertools import product
 from pathlib import Path
-from typing import NoReturn
+from typing import Any
 
 import torch
 from omegaconf import OmegaConf
@@ -22,11 +23,11 @@ from omegaconf import OmegaConf
 # The script measures the package that it stands beside, from any folder.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import measuring
 from rasterizer_bench.check import check, check_long_sort
-from rasterizer_bench.report import HEADER, Report, SceneStages, make_rows, show_stages, start_report
 from rasterizer_bench.scenes import Scene, make_scene, make_shell
 from rasterizer_bench.stages import NoKernelsError, copy_speed, time_stages
-from rasterizer_bench.timing import OUT_OF_MEMORY, take_turns
+from rasterizer_bench.timing import OUT_OF_MEMORY, Timing, take_turns
 
 from cadam3d.build import component
 from cadam3d.core.errors import UserError
@@ -43,7 +44,7 @@ DEFAULTS = {
         "views": [1],
         "degrees": [0],
     },
-    "cuda": {  # the scenes in targets.py
+    "cuda": {
         "backends": ["gsplat", "cuda"],
         "counts": [20_000, 100_000, 500_000, 1_000_000, 3_400_000],
         "sizes": [512, 1024],
@@ -59,57 +60,29 @@ COPY_BYTES = {"cuda": 2**31, "cpu": 2**25}
 LONG_SORT = 2**27 + 1
 
 
-class Parser(argparse.ArgumentParser):
-    """A parser that reports errors in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        """Print the message and end the program."""
-        self.exit(2, f"{self.prog}: {message}\n")
-
-
-def whole(low: int):
-    """Return a parser of whole numbers that are at least ``low``."""
-
-    def parse_whole(word: str) -> int:
-        number = int(word)
-        if number < low:
-            raise ValueError
-        return number
-
-    parse_whole.__name__ = f"whole number >= {low}"  # argparse prints this name in its messages
-    return parse_whole
-
-
 def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
-    """Parse and check the command line, and fill in the defaults of the device."""
-    parser = Parser(
-        "bench_rasterizer", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    several = {"nargs": "+", "metavar": "N"}
-    known = option_names("rasterizer")
+    """Parse the command line, and fill in the defaults of the device."""
+    parser = measuring.parser_of(__doc__)
+    several = {"nargs": "+", "metavar": "N", "type": measuring.positive}
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument("--backends", nargs="+", choices=known, help="ratios are relative to the first one")
-    parser.add_argument("--counts", type=whole(1), **several, help="numbers of Gaussians")
-    parser.add_argument("--sizes", type=whole(1), **several, help="sizes of the square images, in pixels")
-    parser.add_argument("--views", type=whole(1), **several, help="numbers of views rendered at once")
     parser.add_argument(
-        "--degrees", type=int, choices=range(4), **several, help="spherical harmonics degrees"
+        "--backends", nargs="+", choices=option_names("rasterizer"), help="ratios: to the first"
     )
-    parser.add_argument("--repeats", type=whole(1), default=10, metavar="N")
+    parser.add_argument("--counts", **several, help="numbers of Gaussians")
+    parser.add_argument("--sizes", **several, help="sizes of the square images, in pixels")
+    parser.add_argument("--views", **several, help="numbers of views rendered at once")
+    parser.add_argument("--degrees", type=int, choices=range(4), nargs="+", help="of spherical harmonics")
+    parser.add_argument("--repeats", type=measuring.positive, default=10, metavar="N")
     # With more threads, other load on the machine affects every number.
-    parser.add_argument("--threads", type=whole(1), default=1, metavar="N")
+    parser.add_argument("--threads", type=measuring.positive, default=1, metavar="N")
     parser.add_argument("--check", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--check-only", action="store_true", help="check the backends without timing them")
     parser.add_argument("--stages", action=argparse.BooleanOptionalAction, default=True, help="of cuda")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write all results to this file")
+    parser.add_argument("--json", type=measuring.new_file, metavar="FILE", help="also write all results")
     args = parser.parse_args(words)
     for name, value in DEFAULTS[args.device].items():
         if getattr(args, name) is None:
             setattr(args, name, value)
-    if args.check_only and not args.check:
-        parser.error("--check-only and --no-check leave nothing to do. Remove one of them")
-    if args.json and not args.json.absolute().parent.is_dir():
-        parser.error(f"--json: the folder {args.json.parent} is missing. Try: mkdir -p {args.json.parent}")
     return args
 
 
@@ -155,39 +128,63 @@ def check_all(
 def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher: Launcher | None) -> None:
     """Time the backends on every scene, print the results, and write them to the JSON file."""
     device = torch.device(args.device)
-    report = start_report(device, {name: value for name, value in vars(args).items() if name != "json"})
-    if launcher and args.stages:
-        report.copy_bytes_per_ms = copy_speed(device, COPY_BYTES[device.type])
-    name = str(report.device["name"])
-    print(f"{name}, {args.threads} thread(s), {args.repeats} repetitions; milliseconds\n{HEADER}")
+    has_stages = launcher is not None and args.stages
+    report: dict[str, Any] = {"machine": measuring.machine(device), "rows": [], "stages": []}
+    report["settings"] = {name: value for name, value in vars(args).items() if name != "json"}
+    report["copy_bytes_per_ms"] = copy_speed(device, COPY_BYTES[device.type]) if has_stages else None
+    print(f"{report['machine']['name']}, {args.threads} thread(s), {args.repeats} repetitions; milliseconds")
     for degree, count in product(args.degrees, args.counts):
         gaussians = make_shell(count, degree, device)
         for size, views in product(args.sizes, args.views):
-            at, scene = (count, size, views, degree), make_scene(gaussians, size, views)
+            at = {"count": count, "size": size, "views": views, "degree": degree}
+            scene = make_scene(gaussians, size, views)
             timings = take_turns(backends, scene, args.repeats)
-            rows = make_rows(at, timings, name)
-            report.rows += rows
-            print(*rows, sep="\n", flush=True)
-            if launcher and args.stages and timings["cuda"]:
-                add_stages(report, at, launcher, scene)
+            rows = make_rows(at, timings)
+            report["rows"] += rows
+            print(f"\n{measuring.table(list(map(shown, rows)))}", flush=True)
+            if has_stages and timings["cuda"]:
+                report["stages"] += add_stages(at, launcher, scene, args.repeats, report["copy_bytes_per_ms"])
             # The file is written after every scene, because a later one may exceed the memory.
-            if args.json:
-                report.write(args.json)
-    verdicts = [row.is_met for row in report.rows if row.is_met is not None]
-    if verdicts:
-        print(f"{sum(verdicts)} of {len(verdicts)} targets met")
+            measuring.write(args.json, report)
 
 
-def add_stages(report: Report, at: tuple[int, int, int, int], launcher: Launcher, scene: Scene) -> None:
-    """Time the stages of a scene, add them to the report, and print them."""
-    assert report.copy_bytes_per_ms is not None
+def make_rows(at: dict[str, int], timings: dict[str, Timing | None]) -> list[dict[str, Any]]:
+    """Return the times of each backend on one scene, in milliseconds; ``None`` if it ran out of memory."""
+    first = next(iter(timings.values()))
+    rows = []
+    for name, timing in timings.items():
+        row: dict[str, Any] = {**at, "backend": name, "step_ms": None}
+        if timing is not None:
+            row |= {f"{phase}_ms": value for phase, value in timing.median_ms.items()}
+            row["ratio"] = None if first is None else first.median_ms["step"] / timing.median_ms["step"]
+            row["peak_bytes"] = timing.peak_bytes
+        rows.append(row)
+    return rows
+
+
+def shown(row: dict[str, Any]) -> dict[str, object]:
+    """Return a row with its numbers as text."""
+    if row["step_ms"] is None:
+        return {**row, "step_ms": "out of memory"}
+    return {key: f"{value:.2f}" if isinstance(value, float) else value for key, value in row.items()}
+
+
+def add_stages(
+    at: dict[str, int], launcher: Launcher, scene: Scene, repeats: int, speed: float
+) -> list[dict[str, Any]]:
+    """Time and print the stages of a scene, and return them for the report."""
     try:
-        timing = time_stages(launcher, scene, report.settings["repeats"], report.copy_bytes_per_ms)
+        timing = time_stages(launcher, scene, repeats, speed)
     except NoKernelsError as error:
         print(f"no stages: {error}", flush=True)
-        return
-    report.stages.append(SceneStages(*at, timing.wall_ms, timing.kernel_ms, timing.stages))
-    print(show_stages(timing.stages), flush=True)
+        return []
+    stages = [asdict(stage) for stage in timing.stages]
+    rows = [
+        {key: f"{value:.3f}" if isinstance(value, float) else value for key, value in stage.items()}
+        for stage in stages
+    ]
+    print(f"\n{measuring.table(rows)}", flush=True)
+    return [{**at, "wall_ms": timing.wall_ms, "kernel_ms": timing.kernel_ms, "stages": stages}]
 
 
 def run(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher: Launcher | None) -> int:
@@ -203,6 +200,7 @@ def run(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher: Lau
 
 
 def main(words: Sequence[str] | None = None) -> int:
+    """Return the exit code."""
     args = parse(words)
     try:
         if args.device == "cuda" and not torch.cuda.is_available():

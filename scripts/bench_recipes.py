@@ -9,7 +9,6 @@ like a real model, so that loading is timed too (Stable Diffusion 2.1: 1.9 GB, 3
 
 import argparse
 import json
-import subprocess
 import sys
 import tempfile
 import time
@@ -23,6 +22,8 @@ import torch
 
 # The script measures the package that it stands beside, from any folder.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import measuring
 
 from cadam3d.build import build_trainer, component
 from cadam3d.commands.beginning import run_context
@@ -126,18 +127,13 @@ class Stopwatch:
 
     def __call__(self, stage: str, work: Callable[..., Any]) -> Callable[..., Any]:
         def timed(*args: Any, **kwargs: Any) -> Any:
-            started = self.now()
+            started = measuring.now(self.device)
             result = work(*args, **kwargs)
-            self.seconds[stage] += self.now() - started
+            self.seconds[stage] += measuring.now(self.device) - started
             self.calls[stage] += 1
             return result
 
         return timed
-
-    def now(self) -> float:
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-        return time.perf_counter()
 
 
 def random_texts(prior: Any) -> None:
@@ -186,9 +182,9 @@ def measure(recipe: str, model: Path, args: argparse.Namespace) -> dict[str, Any
         warm.train(state, embedding, context)
         watch.seconds.clear()
         watch.calls.clear()
-        before = watch.now()
+        before = measuring.now(device)
         trainer.train(state, embedding, context)
-        total = watch.now() - before
+        total = measuring.now(device) - before
     steps = args.steps - args.warmup
     stages = {name: seconds / steps for name, seconds in watch.seconds.items()}
     stages["everything else, backward included"] = total / steps - sum(stages.values())
@@ -221,22 +217,8 @@ def estimate(recipe: str, model: Path) -> None:
         )
 
 
-def machine(device: torch.device) -> dict[str, Any]:
-    """Return the device, the versions and the commit of the measurement."""
-    head = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
-    return {
-        "device": name,
-        "torch": torch.__version__,
-        "cuda": torch.version.cuda,
-        "commit": head.stdout.strip(),
-    }
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = measuring.parser_of(__doc__)
     parser.add_argument("--recipes", nargs="+", default=list(RECIPES), choices=list(RECIPES))
     parser.add_argument("--device", default="auto")
     parser.add_argument("--steps", type=int, default=50)
@@ -260,9 +242,9 @@ def main() -> None:
                 continue
             results.append(measure(recipe, model, args))
             print(json.dumps(results[-1], indent=2))
-    if args.json and results:
-        facts = machine(resolve_device(args.device))
-        args.json.write_text(json.dumps({"machine": facts, "results": results}, indent=2) + "\n")
+    if results:
+        facts = measuring.machine(resolve_device(args.device))
+        measuring.write(args.json, {"machine": facts, "results": results})
 
 
 if __name__ == "__main__":

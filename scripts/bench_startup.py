@@ -7,56 +7,23 @@ line of its metrics.jsonl is on the disk, which is the end of step 1. The wall-c
 load of the machine. The CPU time (user plus system) of the process hardly does.
 """
 
-import argparse
-import json
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from checkouts import add_base, environment_of, find_trees
+import measuring
 
 DEMO = "a red and yellow checkered torus"
 POLL_SECONDS = 0.002
 LONGEST_SECONDS = 120.0
 
 
-@dataclass(frozen=True)
-class Timing:
-    """The times of one start, in seconds."""
-
-    wall: float
-    cpu: float  # user plus system, children included
-
-
-def main() -> None:
-    args = read_arguments()
-    trees = find_trees(args.base)
-    for tree in trees.values():
-        # The first run fills the caches of bytecode, compiled kernels and the disk.
-        measure(tree, args.settings)
-    timings: dict[str, list[Timing]] = {name: [] for name in trees}
-    for _ in range(args.repeats):
-        for name, tree in trees.items():
-            timings[name].append(measure(tree, args.settings))
-    print(json.dumps(summarize(timings), indent=2) if args.json else as_text(timings))
-
-
-def read_arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    add_base(parser)
-    parser.add_argument("--repeats", type=int, default=7, help="starts of each tree (default: 7)")
-    parser.add_argument("--json", action="store_true", help="print numbers for programs")
-    parser.add_argument("settings", nargs="*", help="further settings of the training, such as prior=tiny")
-    return parser.parse_args()
-
-
-def measure(tree: Path, settings: list[str]) -> Timing:
-    """Start the demo with the sources of ``tree``, and kill it at the end of its first step."""
+def measure(tree: Path, settings: list[str]) -> dict[str, float]:
+    """Start the demo with the sources of ``tree``, kill it at the end of its first step; return seconds."""
     with tempfile.TemporaryDirectory() as place, (Path(place) / "console.txt").open("w") as console:
         metrics = Path(place) / "run" / "metrics.jsonl"
         words = [f"prompt={DEMO}", f"hydra.run.dir={metrics.parent}", *settings]
@@ -64,12 +31,12 @@ def measure(tree: Path, settings: list[str]) -> Timing:
         process = subprocess.Popen(
             [sys.executable, "-m", "cadam3d", "train", *words],
             cwd=place,
-            env=environment_of(tree),
+            env=measuring.environment_of(tree),
             stdout=console,
             stderr=subprocess.STDOUT,
         )
         try:
-            while not has_line(metrics):
+            while not (metrics.is_file() and b"\n" in metrics.read_bytes()):
                 if process.poll() is not None or time.perf_counter() - started > LONGEST_SECONDS:
                     raise SystemExit(f"{tree}: no first step\n{Path(console.name).read_text()}")
                 time.sleep(POLL_SECONDS)
@@ -79,38 +46,28 @@ def measure(tree: Path, settings: list[str]) -> Timing:
             _, _, usage = os.wait4(process.pid, 0) if process.returncode is None else (0, 0, None)
             process.returncode = process.returncode or 0
         assert usage is not None
-        return Timing(wall=wall, cpu=usage.ru_utime + usage.ru_stime)
+        return {"wall s": wall, "CPU s": usage.ru_utime + usage.ru_stime}
 
 
-def has_line(path: Path) -> bool:
-    return path.is_file() and b"\n" in path.read_bytes()
-
-
-def summarize(timings: dict[str, list[Timing]]) -> dict[str, object]:
-    medians = {
-        name: {
-            "wall_seconds": statistics.median(timing.wall for timing in found),
-            "cpu_seconds": statistics.median(timing.cpu for timing in found),
-            "starts": len(found),
-        }
-        for name, found in timings.items()
+def main(words: list[str] | None = None) -> None:
+    """Print the table."""
+    parser = measuring.parser_of(__doc__)
+    measuring.add_base(parser)
+    parser.add_argument("--repeats", type=measuring.positive, default=7, help="starts of each tree")
+    parser.add_argument("--json", type=measuring.new_file, help="file for all numbers")
+    parser.add_argument("settings", nargs="*", help="further settings of the training, such as prior=tiny")
+    args = parser.parse_args(words)
+    works = {
+        name: partial(measure, tree, args.settings) for name, tree in measuring.find_trees(args.base).items()
     }
-    if "base" not in medians:
-        return medians
-    ratios = {key: medians["here"][key] / medians["base"][key] for key in ("wall_seconds", "cpu_seconds")}
-    return {**medians, "here_to_base": ratios}
-
-
-def as_text(timings: dict[str, list[Timing]]) -> str:
-    """Return a table of medians, and the ratio of this tree to the other one."""
-    lines = [f"{'':<8}{'wall':>9}{'CPU':>9}   median of {len(timings['here'])} starts"]
-    found = summarize(timings)
-    for name in timings:
-        lines.append(f"{name:<8}{found[name]['wall_seconds']:>7.2f} s{found[name]['cpu_seconds']:>7.2f} s")
-    if "here_to_base" in found:
-        wall, cpu = found["here_to_base"]["wall_seconds"], found["here_to_base"]["cpu_seconds"]
-        lines.append(f"{'ratio':<8}{wall:>9.3f}{cpu:>9.3f}   below 1: this tree starts faster")
-    return "\n".join(lines)
+    # The first run fills the caches of bytecode, compiled kernels and the disk.
+    turns = measuring.in_turns(works, args.repeats, warm_up=1)
+    found = {name: measuring.median(each) for name, each in turns.items()}
+    if "base" in found:
+        found["here / base"] = {key: found["here"][key] / found["base"][key] for key in found["here"]}
+    rows = [{"": name} | {key: f"{value:.3f}" for key, value in each.items()} for name, each in found.items()]
+    print(f"medians of {args.repeats} starts\n\n{measuring.table(rows)}")
+    measuring.write(args.json, {"machine": measuring.machine(), **found})
 
 
 if __name__ == "__main__":

@@ -27,8 +27,6 @@ Every prior has a process of its own. With ``--base`` both trees run in turn.
 import argparse
 import json
 import os
-import platform
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -36,7 +34,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from checkouts import HERE, add_base, find_trees
+import measuring
+from measuring import HERE, add_base, find_trees
 from step_bench.clocks import ORDER, replaced
 from step_bench.passes import Run, three_passes
 
@@ -65,37 +64,39 @@ def main(words: list[str] | None = None) -> None:
             print(f"{prior} is left out: {error}")
             continue
         for name, found in turns.items():
-            results[name].append(middle(found))
+            results[name].append(measuring.median(found))
         print(as_table({name: found[-1] for name, found in results.items()}), flush=True)
     if args.json:
-        args.json.write_text(json.dumps({"machine": machine(args.device), **results}, indent=2) + "\n")
+        measuring.write(args.json, {"machine": measuring.machine(args.device), **results})
     if not results["here"]:
         raise SystemExit(1)
 
 
 def read_arguments(words: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = measuring.parser_of(__doc__)
     parser.add_argument("--priors", nargs="+", choices=list(PRIORS), help="default: all, random on CUDA only")
     parser.add_argument("--device", default="cpu", help="cpu (default), cuda or auto")
-    parser.add_argument("--steps", type=positive, default=40, help="steps of each of the first two passes")
-    parser.add_argument("--warmup", type=positive, default=5, help="steps before them that are not timed")
-    parser.add_argument("--threads", type=positive, default=1, help="threads of torch (default: 1)")
+    parser.add_argument(
+        "--steps", type=measuring.positive, default=40, help="steps of each of the first two passes"
+    )
+    parser.add_argument(
+        "--warmup", type=measuring.positive, default=5, help="steps before them that are not timed"
+    )
+    parser.add_argument("--threads", type=measuring.positive, default=1, help="threads of torch (default: 1)")
     parser.add_argument("--tiny", action="store_true", help="small networks for --priors random")
     parser.add_argument("--models", type=Path, help="folder that keeps the random networks")
     add_base(parser)
     parser.add_argument(
-        "--repeats", type=positive, default=3, help="turns of each tree with --base (default: 3)"
+        "--repeats", type=measuring.positive, default=3, help="turns of each tree with --base (default: 3)"
     )
     # For the processes that measure one prior of one tree.
     parser.add_argument("--tree", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("--json", type=Path, help="file for all numbers")
+    parser.add_argument("--json", type=measuring.new_file, help="file for all numbers")
     parser.add_argument("settings", nargs="*", help="more settings of cadam3d train, such as steps=1000")
     # Settings come first, because the list of priors would swallow those after it.
     words = sorted(sys.argv[1:] if words is None else words, key=lambda word: not is_setting(word))
     args = parser.parse_intermixed_args(words)
-    if args.json and not args.json.absolute().parent.is_dir():
-        parser.error(f"argument --json: expected a file in a folder that exists, got {args.json}")
     if args.priors is None:
         args.priors = [name for name in PRIORS if name != "random" or args.device.startswith("cuda")]
     return args
@@ -103,12 +104,6 @@ def read_arguments(words: list[str] | None) -> argparse.Namespace:
 
 def is_setting(word: str) -> bool:
     return "=" in word and not word.startswith("-")
-
-
-def positive(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, got {text}")
-    return int(text)
 
 
 # -------------------------------------------------------------------------- processes
@@ -128,17 +123,6 @@ def measure_there(tree: Path, prior: str, args: argparse.Namespace) -> dict[str,
             lines = done.stderr.strip().splitlines()
             raise LeftOutError(lines[-1] if lines else f"the process ended with code {done.returncode}")
         return json.loads(out.read_text())
-
-
-def middle(turns: list[Any]) -> Any:
-    """Return nested results with the median of every number; all else is that of the first turn."""
-    first = turns[0]
-    if isinstance(first, dict):
-        return {key: middle([turn.get(key) for turn in turns]) for key in first}
-    if all(turn == first for turn in turns):
-        return first
-    numbers = [turn for turn in turns if isinstance(turn, int | float)]
-    return statistics.median(numbers) if len(numbers) == len(turns) else first
 
 
 # -------------------------------------------------------------------------- one prior of one tree
@@ -161,8 +145,8 @@ def measure_here(prior: str, args: argparse.Namespace) -> dict[str, Any]:
     build, loop = train.build_trainer, trainer.Trainer.train
     found: dict[str, Any] = {}
 
-    def build_trainer(*arguments: Any) -> Any:
-        built = build(*arguments)
+    def build_trainer(*arguments: Any, **named: Any) -> Any:
+        built = build(*arguments, **named)
         if prior == "random":
             import_module("bench_recipes").random_texts(built.prior)
         return built
@@ -236,19 +220,6 @@ def as_cells(found: dict[str, Any], name: str) -> str:
     share = 100 * milliseconds / sum(found["parts_ms"].values())
     operations, readbacks = found["operations"].get(name, 0), found["readbacks"].get(name, 0)
     return f"{milliseconds:>12.3f}{share:>6.1f} %{operations:>8.0f}{readbacks:>7.1f}"
-
-
-def machine(device: str) -> dict[str, Any]:
-    """Return the device, the versions and the commit of the measurement."""
-    import torch
-
-    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=HERE, capture_output=True, text=True, check=False)
-    is_cuda = device != "cpu" and torch.cuda.is_available()
-    return {
-        "device": torch.cuda.get_device_name() if is_cuda else platform.processor() or platform.machine(),
-        "torch": torch.__version__,
-        "commit": head.stdout.strip(),
-    }
 
 
 if __name__ == "__main__":

@@ -13,9 +13,9 @@ import argparse
 import ctypes
 import os
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 # The script measures the package that it stands beside, from any folder.
@@ -27,6 +27,7 @@ from cadam3d.core.openmp import waiting
 os.environ.update(waiting(os.environ))
 
 import torch
+from measuring import in_turns, milliseconds, parser_of, positive, table
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
 from cadam3d.core.errors import UserError
@@ -53,45 +54,31 @@ def views(count: int, size: int, elevation_deg: float = 15.0) -> Cameras:
     return turntable(count, elevation_deg=elevation_deg, distance=distance, fov_y_deg=FOV_DEG, size=size)
 
 
-def seconds(call: Callable[[], object], threads: int) -> float:
-    """Return the time of one call."""
-    clock = time.process_time if threads == 1 else time.perf_counter
-    start = clock()
-    call()
-    return clock() - start
-
-
 def compare_times(args: argparse.Namespace, library: ctypes.CDLL) -> None:
     """Print one row for each prompt, size and number of threads."""
-    print("| prompt | parts | size | views | threads | torch [ms] | native [ms] | ratio |")
-    print("|---|---|---|---|---|---|---|---|")
-    for prompt in args.prompts:
-        scene = scene_of(prompt)
-        for size in args.sizes:
-            cameras = views(args.views, size)
-            calls = (
-                partial(trace, scene, cameras, args.samples),
-                partial(trace_natively, library, scene, cameras, args.samples),
-            )
-            for threads in args.threads:
-                torch.set_num_threads(threads)
-                torch_times, native_times = [], []
-                for _ in range(args.repeats):
-                    torch_times.append(seconds(calls[0], threads))
-                    # The mean of five calls, because one is short. The smallest of five would flatter it.
-                    native_times.append(sum(seconds(calls[1], threads) for _ in range(5)) / 5)
-                slow, fast = 1e3 * min(torch_times), 1e3 * min(native_times)
-                print(
-                    f"| {prompt} | {len(scene.radii)} | {size} | {args.views} | {threads} | {slow:.2f} | "
-                    f"{fast:.3f} | {slow / fast:.1f} |",
-                    flush=True,
-                )
+    rows = []
+    for prompt, size, threads in product(args.prompts, args.sizes, args.threads):
+        scene, cameras = scene_of(prompt), views(args.views, size)
+        torch.set_num_threads(threads)
+        calls = {
+            "torch": partial(trace, scene, cameras, args.samples),
+            "native": partial(trace_natively, library, scene, cameras, args.samples),
+        }
+        # The mean of five native calls, because one is short. The smallest of five would flatter it.
+        works = {
+            name: partial(milliseconds, call, torch.device("cpu"), times=5 if name == "native" else 1)
+            for name, call in calls.items()
+        }
+        slow, fast = (min(times) for times in in_turns(works, args.repeats).values())
+        row = {"prompt": prompt, "parts": len(scene.radii), "size": size, "views": args.views}
+        row |= {"threads": threads, "torch [ms]": f"{slow:.2f}", "native [ms]": f"{fast:.3f}"}
+        rows.append({**row, "ratio": f"{slow / fast:.1f}"})
+    print(table(rows))
 
 
 def compare_images(args: argparse.Namespace, library: ctypes.CDLL) -> None:
     """Print how many samples and pixels differ for each pattern, and by how much."""
-    print("| pattern | samples | other coverage | other paint | mean difference | largest difference |")
-    print("|---|---|---|---|---|---|")
+    rows = []
     names = args.objects or (*known_primitives(), *known_objects())
     for pattern in PATTERN_NAMES:
         count, covered, painted, total, largest = 0, 0, 0, 0.0, 0.0
@@ -106,10 +93,9 @@ def compare_images(args: argparse.Namespace, library: ctypes.CDLL) -> None:
                 covered += int((ours.alpha != expected.alpha).sum())
                 painted += int((difference > TOLERANCE).sum())
                 total, largest = total + float(difference.sum()), max(largest, float(difference.max()))
-        print(
-            f"| {pattern} | {count:,} | {covered} | {painted} | {total / count:.1e} | {largest:.1e} |",
-            flush=True,
-        )
+        row = {"pattern": pattern, "samples": count, "other coverage": covered, "other paint": painted}
+        rows.append(row | {"mean difference": f"{total / count:.1e}", "largest difference": f"{largest:.1e}"})
+    print(table(rows))
 
 
 def largest_differences(ours: Layers, expected: Layers) -> torch.Tensor:
@@ -119,20 +105,18 @@ def largest_differences(ours: Layers, expected: Layers) -> torch.Tensor:
 
 def main(words: Sequence[str] | None = None) -> None:
     """Read the command line and print a table."""
-    parser = argparse.ArgumentParser(
-        "bench_tracer", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--agreement", action="store_true", help="compare images instead of times")
     parser.add_argument("--prompts", nargs="+", default=PROMPTS, help="scenes that are timed")
     parser.add_argument("--objects", nargs="+", help="objects whose images are compared; default: all")
-    parser.add_argument("--sizes", nargs="+", type=int, default=[112, 512], help="pixels along an edge")
-    parser.add_argument("--views", type=int, default=2, help="images per call")
-    parser.add_argument("--samples", type=int, default=2, help="rays per pixel along each axis, for times")
-    parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
-    parser.add_argument("--repeats", type=int, default=10, help="turns for each row")
+    parser.add_argument("--sizes", nargs="+", type=positive, default=[112, 512], help="pixels along an edge")
+    parser.add_argument("--views", type=positive, default=2, help="images per call")
+    parser.add_argument(
+        "--samples", type=positive, default=2, help="rays per pixel along each axis, for times"
+    )
+    parser.add_argument("--threads", nargs="+", type=positive, default=[1, 2])
+    parser.add_argument("--repeats", type=positive, default=10, help="turns for each row")
     args = parser.parse_args(words)
-    if min(*args.sizes, args.views, args.samples, *args.threads, args.repeats) < 1:
-        parser.error("sizes, views, samples, threads and repeats: expected whole numbers >= 1")
     try:
         built, library = load_tracer()
     except UserError as error:

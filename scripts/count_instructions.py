@@ -27,7 +27,7 @@ import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from checkouts import add_base, environment_of, find_trees
+from measuring import add_base, environment_of, find_trees
 
 INSTALL = "pip install nvidia-cuda-nvrtc nvidia-cuda-nvdisasm"
 # Runs in either checkout: writes the cubin, and prints the log of the assembler.

@@ -2,7 +2,6 @@
 
     python scripts/gpu.py                     # checks, then times, then explanations
     python scripts/gpu.py --part checks       # one of the three parts, each less than ten minutes
-    python scripts/gpu.py --wheels            # packages to copy to a machine without a package registry
     python scripts/gpu.py --markdown FILE     # show the JSON of a run as Markdown
 
 If a check fails, nothing is timed, and the stage of the kernels that is wrong is named. The same line
@@ -36,7 +35,6 @@ from gpu_run.markdown import show
 from gpu_run.pieces import PARTS
 from gpu_run.record import read_record
 from gpu_run.session import AGAIN, Session
-from gpu_run.wheels import describe
 
 FOLDER = REPOSITORY / "outputs" / "gpu"
 
@@ -60,7 +58,6 @@ def parse(words: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--torch", action="store_true", help="only print which torch to install; nothing if there is one"
     )
-    parser.add_argument("--wheels", action="store_true", help="only list the packages to copy")
     parser.add_argument(
         "--markdown", type=Path, metavar="FILE", help="only show the JSON of a run as Markdown"
     )
@@ -101,9 +98,6 @@ def advise(error: OSError) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """Do what the options say, and return the exit code."""
-    if args.wheels:
-        print(describe())
-        return 0
     if args.markdown:
         print(show(read_record(args.markdown)), end="")
         return 0

@@ -11,13 +11,12 @@ Some recipes start from Shap-E, which is not part of cadam3d. Where it is not av
 ball, and their summaries say so. The same line again runs only what has no result yet.
 """
 
-import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import trained_runs
+import measuring
 from PIL import Image, ImageDraw
 
 GAUSSIANS = 5000  # at the start of every recipe
@@ -85,9 +84,7 @@ def picture(previews: Mapping[str, Path], path: Path) -> None:
 
 
 def main(line: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = measuring.parser_of(__doc__)
     parser.add_argument(
         "--out", type=Path, required=True, help="folder of the runs, the table and the picture"
     )
@@ -95,13 +92,13 @@ def main(line: Sequence[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--recipes", nargs="+", choices=list(RECIPES), default=list(RECIPES))
     arguments, settings = parser.parse_known_args(line)
-    out = arguments.out / trained_runs.folder_name(f"{arguments.prompt} {arguments.steps}", settings)
-    lines = [trained_runs.header(COLUMNS)]
+    out = arguments.out / measuring.folder_name(f"{arguments.prompt} {arguments.steps}", settings)
+    lines = [measuring.header(COLUMNS)]
     print(lines[0])
     for name in arguments.recipes:
         own = RECIPES[name].settings(name, arguments.prompt, arguments.steps)
-        found = trained_runs.result(out / name, [*own, *settings])
-        lines.append(trained_runs.line_of([show(name, found) for show in COLUMNS.values()]))
+        found = measuring.trained(out / name, [*own, *settings])
+        lines.append(measuring.line_of([show(name, found) for show in COLUMNS.values()]))
         print(lines[-1], flush=True)
     (out / "recipes.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     picture({name: out / name / "preview.png" for name in arguments.recipes}, out / "recipes.png")

@@ -37,12 +37,3 @@ def test_the_images_agree(capsys):
     found = rows(capsys, "--agreement", "--objects", "cube", "mug", "--sizes", "8", "--views", "1")
     assert [row[0] for row in found] == ["plain", "striped", "checkered", "spotted"]
     assert all(row[1:4] == ["384", "0", "0"] for row in found)
-
-
-@pytest.mark.parametrize(
-    "words", [["--sizes", "0"], ["--samples", "0"], ["--threads", "0"], ["--repeats", "0"]]
-)
-def test_a_number_that_makes_no_sense_is_one_message(words, capsys):
-    with pytest.raises(SystemExit):
-        bench_tracer.main(words)
-    assert "expected whole numbers >= 1" in capsys.readouterr().err

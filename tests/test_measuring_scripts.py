@@ -10,8 +10,8 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 import bench_priors
+import measuring
 import prove_recipes
-import trained_runs
 
 from cadam3d.settings.compose import compose
 
@@ -34,7 +34,7 @@ def trained(monkeypatch):
         lines.append(settings[:-1])
         return 0
 
-    monkeypatch.setattr(trained_runs.subprocess, "call", train)
+    monkeypatch.setattr(measuring.subprocess, "call", train)
     return lines
 
 
@@ -58,14 +58,14 @@ def test_every_prompt_is_trained_once_with_lines_that_compose(line, trained, tmp
 def test_a_run_without_a_summary_is_trained_again(trained, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "asset.ply").touch()
-    assert trained_runs.result(tmp_path / "run", ["prompt=cube"])["prompt"] == "cube"
+    assert measuring.trained(tmp_path / "run", ["prompt=cube"])["prompt"] == "cube"
     assert not (tmp_path / "run" / "asset.ply").exists()
 
 
 def test_a_run_that_fails_ends_the_script_with_its_exit_code(tmp_path, monkeypatch):
-    monkeypatch.setattr(trained_runs.subprocess, "call", lambda *_, **__: 3)
+    monkeypatch.setattr(measuring.subprocess, "call", lambda *_, **__: 3)
     with pytest.raises(SystemExit, match="exit code 3"):
-        trained_runs.result(tmp_path / "run", ["prompt=cube"])
+        measuring.trained(tmp_path / "run", ["prompt=cube"])
 
 
 def test_the_verdict_counts_colour_outline_and_both():

@@ -88,17 +88,13 @@ def scene(row: dict[str, Any]) -> str:
 
 
 def time_of(row: dict[str, Any]) -> str:
-    """Return the times, the memory and the verdict of a row of ``bench_rasterizer``."""
+    """Return the times and the memory of a row of ``bench_rasterizer``."""
     if row["step_ms"] is None:
         return "out of memory"
     phases = [f"{phase} {row[f'{phase}_ms']:.2f}" for phase in ("host", "forward", "backward")]
     words = [f"{row['step_ms']:.2f} ({', '.join(phases)})"]
     if row["peak_bytes"] is not None:
         words.append(f"{row['peak_bytes'] / MB:.0f} MB")
-    targets = [f"{row['demanded_ms']:g} ms"] if row["demanded_ms"] is not None else []
-    targets += [f"{row['demanded_ratio']:g}x gsplat"] if row["demanded_ratio"] is not None else []
-    if row["is_met"] is not None:
-        words.append(f"target {', '.join(targets)}: {'met' if row['is_met'] else '**missed**'}")
     return "; ".join(words)
 
 

@@ -182,8 +182,9 @@ def compare_sorts(launcher: Any, device: Any, sizes: Any, repeats: int) -> dict[
     """Return the times of both sorts, which take turns."""
     import statistics
 
+    from measuring import now
     from rasterizer_bench.check import make_keys, sort_keys
-    from rasterizer_bench.timing import OUT_OF_MEMORY, now
+    from rasterizer_bench.timing import OUT_OF_MEMORY
 
     def took(work: Callable[[], object]) -> float:
         begin = now(device)

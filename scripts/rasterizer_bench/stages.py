@@ -17,8 +17,8 @@ from functools import partial
 
 import torch
 from jaxtyping import Float
+from measuring import now
 from rasterizer_bench.scenes import Scene
-from rasterizer_bench.timing import now
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras

@@ -1,10 +1,10 @@
 """Measure the time and the memory of the phases of a step."""
 
 import statistics
-import time
 from dataclasses import dataclass
 
 import torch
+from measuring import now
 from rasterizer_bench.scenes import Scene
 
 from cadam3d.rasterizer.base import Rasterizer
@@ -20,7 +20,6 @@ class Timing:
     """The times of one backend on one scene, over all repetitions."""
 
     median_ms: dict[str, float]  # by phase
-    min_ms: dict[str, float]
     peak_bytes: int | None  # without the scene itself; None if it cannot be measured
 
 
@@ -49,13 +48,8 @@ def take_turns(backends: dict[str, Rasterizer], scene: Scene, repeats: int) -> d
 
 
 def summarize(samples: list[dict[str, float]], peak: int | None) -> Timing:
-    """Return the median and the smallest time of each phase, with the peak of memory."""
-    by_phase = {phase: [sample[phase] for sample in samples] for phase in PHASES}
-    return Timing(
-        {phase: statistics.median(each) for phase, each in by_phase.items()},
-        {phase: min(each) for phase, each in by_phase.items()},
-        peak,
-    )
+    """Return the median time of each phase, with the peak of memory."""
+    return Timing({phase: statistics.median(each[phase] for each in samples) for phase in PHASES}, peak)
 
 
 def time_phases(rasterizer: Rasterizer, scene: Scene) -> dict[str, float]:
@@ -87,13 +81,6 @@ def time_phases(rasterizer: Rasterizer, scene: Scene) -> dict[str, float]:
         "step": step * 1e3,
         "host": host * 1e3,
     }
-
-
-def now(device: torch.device) -> float:
-    """Return the time in seconds, after waiting for the device."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()
 
 
 def peak_memory(rasterizer: Rasterizer, scene: Scene) -> int | None:

@@ -26,28 +26,24 @@ def _cached_kernels(kernel_build, tmp_path, monkeypatch):
     shutil.copy2(kernel_build.path, folder)
 
 
-def test_every_scene_gets_times_stages_and_bytes(tmp_path, capsys):
-    words = ["--counts", "50", "300", "--sizes", "24", "--threads", "1", "2", "--repeats", "1"]
-    bench_large.main([*words, "--base", str(bench_large.HERE), "--json", str(tmp_path / "large.json")])
-    result = json.loads((tmp_path / "large.json").read_text())
-    assert [row["count"] for row in result["times"]] == [50, 300]
-    for row in result["times"]:
-        assert {name: list(ms) for name, ms in row["ms"].items()} == {"here": ["1", "2"], "base": ["1", "2"]}
-    for scene in result["stages"]:
-        assert [row["stage"] for row in scene["stages"]] == [*STAGES, "Python and autograd"]
-        assert all(row["mb"] > 0 for row in scene["stages"][:-1])
+def test_every_scene_gets_times_and_stages(tmp_path, capsys):
+    words = ["--counts", "50", "--sizes", "24", "--threads", "1", "--repeats", "1"]
+    bench_large.main(
+        [*words, "--base", str(bench_large.measuring.HERE), "--json", str(tmp_path / "large.json")]
+    )
+    (row,) = json.loads((tmp_path / "large.json").read_text())["times"]
+    assert list(row["ms"]) == ["base, 1 threads", "here, 1 threads"]
+    assert list(row["ms"]["here, 1 threads"]["stages"]) == list(STAGES)
     shown = capsys.readouterr().out
-    assert "base / here, 2 threads" in shown
+    assert "base / here, 1 threads" in shown
     assert "| blend backward |" in shown
 
 
-def test_memory_is_measured_beside_the_sum_of_the_arrays(tmp_path, capsys):
-    words = ["--memory", "--counts", "300", "--sizes", "24", "--views", "2", "--threads", "1"]
+def test_memory_is_measured(tmp_path):
+    words = ["--memory", "--counts", "300", "--sizes", "24", "--threads", "1"]
     bench_large.main([*words, "--json", str(tmp_path / "memory.json")])
     (row,) = json.loads((tmp_path / "memory.json").read_text())["memory"]
-    assert row["arrays"] > 300 * 2 * 100
-    assert row["here"]["peak_bytes"] >= 0
-    assert "bytes per Gaussian" in capsys.readouterr().out
+    assert row["peak_bytes"]["here"] >= 0
 
 
 def test_costs_count_the_slots_of_a_pass_of_this_rasterizer_only(cpu):

@@ -1,16 +1,19 @@
-"""Benchmarks that compare two checkouts measure the one that was named, or refuse it."""
+"""What benchmarks share: the named checkout is measured, turns alternate, and ratios are right."""
 
 import argparse
 import os
 import subprocess
 import sys
+import time
+from functools import partial
 from pathlib import Path
 
 import pytest
+import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))  # as Python does for a script
 
-from checkouts import HERE, add_base, environment_of, find_trees
+from measuring import HERE, add_base, environment_of, find_trees, in_turns, median, milliseconds
 
 
 def parse(*words: str) -> argparse.Namespace:
@@ -44,5 +47,19 @@ def test_a_process_imports_the_package_of_its_checkout(tmp_path):
         assert Path(done.stdout.strip()).parents[1] == tree
 
 
-def test_without_a_base_only_this_checkout_is_measured():
-    assert find_trees(parse().base) == {"here": HERE}
+def test_a_planted_delay_shows_in_the_ratio_of_turns_that_alternate():
+    order = []
+
+    def work(name: str, seconds: float) -> float:
+        order.append(name)
+        return milliseconds(lambda: time.sleep(seconds), torch.device("meta"))
+
+    works = {"base": partial(work, "base", 0.02), "here": partial(work, "here", 0.06)}
+    found = {name: median(times) for name, times in in_turns(works, 3, warm_up=1).items()}
+    assert order == ["base", "here"] * 4
+    assert found["here"] / found["base"] == pytest.approx(3, rel=0.3)
+
+
+def test_medians_are_taken_of_numbers_at_any_depth():
+    turns = [{"a": {"b": value}, "name": "x", "none": None} for value in (3.0, 1.0, 2.0)]
+    assert median(turns) == {"a": {"b": 2.0}, "name": "x", "none": None}
