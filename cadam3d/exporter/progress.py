@@ -1,6 +1,5 @@
 """ProgressExporter: a video of a training, from the pictures that it has left."""
 
-import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from cadam3d.core.render import RenderFn
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.caption import Caption, side_by_side
 from cadam3d.io.image import read_png, step_pictures
-from cadam3d.io.records import read_metrics, read_summary
+from cadam3d.io.records import read_metrics
 from cadam3d.io.run_folder import PREVIEWS, shown, typed_path
 from cadam3d.io.video import CODECS, FORMATS, write_video
 
@@ -49,7 +48,9 @@ class ProgressExporter(Exporter):
         run = typed_path(self.run) if isinstance(self.run, str) else folder
         pictures = step_pictures(run / PREVIEWS)
         if not pictures:
-            raise UserError(f"{shown(run)}: has no {PREVIEWS}/. Try: {training_with_previews(run)}")
+            raise UserError(
+                f"{shown(run)}: has no {PREVIEWS}/. Try: cadam3d train callback.previews.every=20"
+            )
         path = folder / self.file_name
         write_video(path, self._frames(pictures, counts_in(run)), fps=self.fps)
         return [path]
@@ -96,9 +97,3 @@ def fitted(picture: UInt8[np.ndarray, "h w 3"], shape: tuple[int, ...]) -> UInt8
     cut = picture[:height, :width]
     rest = ((0, height - cut.shape[0]), (0, width - cut.shape[1]), (0, 0))
     return np.pad(cut, rest, constant_values=255)
-
-
-def training_with_previews(run: Path) -> str:
-    """Return a line that trains the prompt of ``run`` again and draws previews."""
-    prompt = read_summary(run).get("prompt") or "a red torus"
-    return f"cadam3d train {shlex.quote(f'prompt={prompt}')} callback.previews.every=20"

@@ -1,14 +1,12 @@
 """Atomic writes: a file is written under another name and then renamed, so it appears whole or not at all."""
 
 import os
-import shlex
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.run_folder import nearest_existing, numbered
 
 TEMPORARY = ".tmp-"  # in the name of every file that is still being written
 
@@ -32,7 +30,7 @@ def replacing(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
-        raise _unwritable(path, Path(error.filename2 or path), error) from error
+        raise _unwritable(path, error) from error
     finally:
         # An earlier error is more important than one of the clean-up.
         with suppress(OSError):
@@ -59,8 +57,7 @@ def replacing_series(folder: Path, is_member: Callable[[str], bool]) -> Iterator
         for new in sorted(temporary.iterdir()):
             new.replace(folder / new.name)
     except OSError as error:
-        place = Path(error.filename2) if error.filename2 else folder / TEMPORARY
-        raise _unwritable(folder, place, error) from error
+        raise _unwritable(folder, error) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -74,15 +71,6 @@ def remove_leftovers(folder: Path) -> None:
             leftover.unlink(missing_ok=True)
 
 
-def _unwritable(path: Path, file: Path, error: OSError) -> UserError:
-    """Return a message about ``path``, where ``file`` cannot be made, with a shell command that helps."""
-    existing = nearest_existing(file)
-    folder = existing if existing.is_dir() else existing.parent
-    if existing.is_dir() == (existing == file):
-        # A folder has the name of the file, or a file has the name of its folder.
-        command = ["mv", str(existing), str(numbered(existing))]
-    elif isinstance(error, PermissionError):
-        command = ["chmod", "u+w", str(folder)]
-    else:
-        command = ["df", "-h", str(folder)]
-    return UserError(f"{path}: cannot be written ({error.strerror or error}). Try: {shlex.join(command)}")
+def _unwritable(path: Path, error: OSError) -> UserError:
+    reason = error.strerror or error
+    return UserError(f"{path}: cannot be written ({reason}). Try: another place, or df -h to see its space")

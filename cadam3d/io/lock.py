@@ -29,9 +29,9 @@ except ImportError:  # Windows
 INHERITED = "CADAM3D_LOCK"
 # On Windows, other processes cannot read a locked byte, so the byte that is locked is far behind the text.
 LOCKED_BYTE = 1 << 30
-# Bytes of a lock file that are read, and characters of a command line that are written and shown.
-LONGEST_NOTE, LONGEST_COMMAND, LONGEST_SHOWN = 1 << 16, 4000, 160
-READINGS, READING_SECONDS = 10, 0.02  # of a note that is not written yet
+# Bytes of a lock file that are read, and characters of each part that are shown.
+LONGEST_NOTE, LONGEST_SHOWN = 1 << 16, 160
+LOOKING_SECONDS = 0.02  # for which :func:`is_held` may hold a lock
 
 
 @contextmanager
@@ -98,7 +98,7 @@ def _lock(file: IO[Any]) -> bool:
     """Lock an open file, and try twice, because :func:`is_held` may hold the lock for an instant."""
     if try_lock(file):
         return True
-    time.sleep(READING_SECONDS)
+    time.sleep(LOOKING_SECONDS)
     return try_lock(file)
 
 
@@ -178,20 +178,14 @@ def taking_turns(folder: Path, on_wait: Callable[[], None]) -> Iterator[None]:
 
 def describe_holder(path: Path) -> str:
     """Describe the process that holds the lock file ``path``, as far as its note can be read."""
-    # A process that has just locked the file needs a moment to write its note.
-    for _ in range(READINGS):
-        if parts := _read_note(path):
-            break
-        time.sleep(READING_SECONDS)
-    else:
+    parts = _read_note(path)
+    if parts is None:
         return "another process"
     # The file may come from elsewhere, and a terminal would obey control characters.
     pid, host, since, command = (
-        "".join(letter if letter.isprintable() else "?" for letter in part) for part in parts
+        "".join(letter if letter.isprintable() else "?" for letter in part[:LONGEST_SHOWN]) for part in parts
     )
-    if len(command) > LONGEST_SHOWN:
-        command = command[:LONGEST_SHOWN] + " ..."
-    return f"process {pid[:20]} on {host[:100]} since {since[:30]} ({command})"
+    return f"process {pid} on {host} since {since} ({command})"
 
 
 def _read_note(path: Path) -> list[str] | None:
@@ -247,7 +241,7 @@ def _write_note(file: IO[bytes]) -> None:
         "pid": os.getpid(),
         "host": socket.gethostname(),
         "since": time.strftime("%Y-%m-%d %H:%M:%S"),
-        "command": shlex.join(["cadam3d", *sys.argv[1:]])[:LONGEST_COMMAND],
+        "command": shlex.join(["cadam3d", *sys.argv[1:]])[:LONGEST_SHOWN],
     }
     # The lock works without the note, for example on a full disk.
     with suppress(OSError):

@@ -232,29 +232,11 @@ def copying(run: Path) -> tuple[str, Path]:
     return f"cp -rL {source} {target} && chmod -R u+w {target}", copy
 
 
-def existing_run(*needed: str) -> Path | None:
-    """Return a finished or begun run that has all files ``needed``, for suggestions; None if there is none.
-
-    This is ``outputs/latest`` if that is a run, or else the run in ``outputs`` whose files are the newest.
-    """
-
-    def has_all(folder: Path) -> bool:
-        return all(has_file(folder, name) for name in needed)
-
-    latest = Path(LATEST)
-    if has_all(latest):
-        return latest
-    outputs = latest.parent
-    found = [folder for folder in (*outputs.glob("*"), *outputs.glob("*/*")) if has_all(folder)]
-    return max(found, key=lambda folder: (folder / needed[0]).stat().st_mtime, default=None)
-
-
 def suggestion(command: str, key: str, *needed: str) -> str:
-    """Return ``COMMAND KEY=RUN`` with a run that exists and has the files ``needed``, or how to train one."""
-    run = existing_run(*needed)
-    if run is None:
+    """Return ``COMMAND KEY=outputs/latest`` if that has the files ``needed``, or how to train a run."""
+    if not all(has_file(Path(LATEST), name) for name in needed):
         return 'cadam3d train prompt="a red torus"'
-    return f"{command} {shlex.quote(f'{key}={run}')}".strip()
+    return f"{command} {key}={LATEST}".strip()
 
 
 def resume_word(place: str | Path) -> str:
