@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from cadam3d.densifier.base import GradientSignal
+from cadam3d.io.records import declared
 
 REPOSITORY = Path(__file__).parent.parent
 PAGE = (REPOSITORY / "docs" / "extending.md").read_text(encoding="utf-8")
@@ -101,6 +102,9 @@ def test_the_exporter_writes_its_file(run):
 def test_the_metric_is_in_the_summary(run):
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     assert 0 <= summary["outliers"] <= 1
+    # What the metric declares reaches the files of the run and its report.
+    assert declared(summary)["outliers"].is_more_better is False
+    assert "Share of outliers" in (run / "report.html").read_text(encoding="utf-8")
     assert summary["densifier"] == "energy"
 
 

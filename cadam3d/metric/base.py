@@ -41,7 +41,7 @@ class Metric(ABC):
     """Interface of all metrics. A subclass is a frozen dataclass of its settings."""
 
     # What the metric can measure. Tables, reports and ``select=`` read this from the files of a run.
-    numbers: ClassVar[tuple[Number, ...]]
+    numbers: ClassVar[tuple[Number, ...]] = ()
 
     def prepare(self) -> None:  # noqa: B027 (most metrics need nothing)
         """Raise ``UserError`` if something is missing that the metric needs, such as the files of a model.
