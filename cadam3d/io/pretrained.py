@@ -120,9 +120,7 @@ class ModelSource:
         )
         reasons: list[str] = []
         for name in self.ids:
-            index, reason, can_ask = fetch_file(
-                name, INDEX, self.revision, can_ask, lacking="not in the layout of diffusers"
-            )
+            index, reason, can_ask = fetch_file(name, INDEX, self.revision, can_ask)
             if index is not None:
                 return Pretrained(self, name, self.revision, index, _read_entries(self.key, index))
             reasons.append(f"{name}: {reason}")
@@ -266,34 +264,16 @@ def _module(library: str) -> Any:
 
 
 def _read_entries(key: str, file: Path) -> dict[str, Any]:
-    try:
-        entries = read_json(file)
-    except UserError as error:
-        reason = str(error).partition(" Try: ")[0]
-        raise UserError(f"{key}: {reason} Try: download the model again") from error
+    entries = read_json(file)
     if not isinstance(entries, dict):
-        raise UserError(
-            f"{key}: {file}: expected names with values, got {entries!r:.40}. Try: download the model again"
-        )
+        raise fail(key, expected=f"names with values in {file}", got=entries, example=f"{key}.path=DIR")
     return entries
 
 
-def fetch_file(
-    name: str, file: str, revision: str | None, can_ask: bool, *, lacking: str
-) -> tuple[Path | None, str, bool]:
-    """Return a file of a model on the hub, or None and the reason, and whether to ask the hub again.
-
-    ``lacking`` says what a model without this file is not.
-    """
+def fetch_file(name: str, file: str, revision: str | None, can_ask: bool) -> tuple[Path | None, str, bool]:
+    """Return a file of a model on the hub, or None and the reason, and whether to ask the hub again."""
     from huggingface_hub import constants, hf_hub_download, utils
-    from huggingface_hub.errors import (
-        EntryNotFoundError,
-        GatedRepoError,
-        HfHubHTTPError,
-        LocalEntryNotFoundError,
-        RepositoryNotFoundError,
-        RevisionNotFoundError,
-    )
+    from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError
 
     offline = constants.HF_HUB_OFFLINE
     verbosity = utils.logging.get_verbosity()
@@ -302,25 +282,15 @@ def fetch_file(
     try:
         found = hf_hub_download(name, file, revision=revision, local_files_only=offline or not can_ask)
         return Path(found), "", can_ask
-    except GatedRepoError:
-        reason = "gated (accept its licence on its page, then: hf auth login)"
-    except RevisionNotFoundError:
-        reason = f"has no revision {revision!r}"
-    except RepositoryNotFoundError:
-        reason = "not on the hub (removed, renamed, or private)"
     except LocalEntryNotFoundError:
-        reason = (
-            f"not on this disk, and {'HF_HUB_OFFLINE is set' if offline else 'the hub cannot be reached'}"
-        )
+        why = "HF_HUB_OFFLINE is set" if offline else "the hub cannot be reached"
         # Every further request would take as long.
-        can_ask = False
-    except EntryNotFoundError:
-        reason = f"has no {file}: {lacking}"
+        return None, f"not on this disk, and {why}", False
     except (HfHubHTTPError, OSError) as error:
-        reason = short(error)
+        # The hub says whether a model is gated, renamed, or lacks the file or the revision.
+        return None, short(error), can_ask
     finally:
         utils.logging.set_verbosity(verbosity)
-    return None, reason, can_ask
 
 
 def read_tensors(key: str, file: Path) -> Mapping[str, Tensor]:

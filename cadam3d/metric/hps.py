@@ -89,7 +89,7 @@ class Hps(ClipMetric):
                 f"{source.name}: expected a file such as {name}, a folder with a CLIP model of transformers "
                 f"or null, got {source.model!r}: nothing there. Try: {source.name}=null"
             )
-        found, reason, _ = fetch_file(source.model, name, source.revision, True, lacking="not HPS v2")
+        found, reason, _ = fetch_file(source.model, name, source.revision, True)
         if found is None:
             raise UserError(
                 f"{source.name}: no model is available. {source.model}: {reason}. Try, with a network "

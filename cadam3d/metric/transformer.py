@@ -76,9 +76,7 @@ class TransformerSource:
         return TransformerFolder(self, folder, folder.name)
 
     def _downloaded(self) -> Path:
-        config, reason, can_ask = fetch_file(
-            self.model, CONFIG, self.revision, True, lacking="not a model of transformers"
-        )
+        config, reason, can_ask = fetch_file(self.model, CONFIG, self.revision, True)
         try:
             if config is not None:
                 return _snapshot(self.model, self.revision, self.needed, can_ask)

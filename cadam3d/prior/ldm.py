@@ -165,7 +165,7 @@ def _weights_file(found: Pretrained, part: str) -> Path:
     for name in names:
         file = Path(found.where) / name
         if not Path(found.where).is_dir():
-            file, reason, _ = fetch_file(found.where, name, found.revision, True, lacking="not this format")
+            file, reason, _ = fetch_file(found.where, name, found.revision, True)
         if file is not None and file.is_file():
             return file
     raise UserError(

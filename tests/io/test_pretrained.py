@@ -188,20 +188,8 @@ def test_ids_are_tried_in_order_and_the_first_available_one_is_used(model, hub):
 def test_if_no_id_is_available_each_has_its_reason_and_there_is_a_hint(hub):
     hub["a/gone"] = refusal(huggingface_hub.errors.RepositoryNotFoundError)
     hub["b/gated"] = refusal(huggingface_hub.errors.GatedRepoError)
-    hub["c/revision"] = refusal(huggingface_hub.errors.RevisionNotFoundError)
-    hub["d/layout"] = refusal(huggingface_hub.errors.RemoteEntryNotFoundError)
-    with pytest.raises(UserError) as caught:
-        source(ids=["a/gone", "b/gated", "c/revision", "d/layout"], revision="v1").find(KINDS, OTHERS)
-    for piece in (
-        "a/gone: not on the hub",
-        "b/gated: gated",
-        "hf auth login",
-        "c/revision: has no revision 'v1'",
-        "d/layout: has no model_index.json",
-        "hf download a/gone --local-dir models/gone",
-        "prior.path=models/gone",
-    ):
-        assert piece in str(caught.value)
+    with pytest.raises(UserError, match=r"a/gone: no.*; b/gated: no.*hf download a/gone --local-dir"):
+        source(ids=["a/gone", "b/gated"], revision="v1").find(KINDS, OTHERS)
 
 
 def test_an_unreachable_hub_is_asked_once(hub):

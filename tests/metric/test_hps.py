@@ -133,7 +133,7 @@ def test_the_version_chooses_the_file_on_the_hub(tmp_path, weights, base, expect
     file = checkpoint(tmp_path, weights)
     asked = []
 
-    def fetch(name, file_name, revision, can_ask, *, lacking):
+    def fetch(name, file_name, revision, can_ask):
         asked.append((name, file_name))
         return file, "", can_ask
 

@@ -1,5 +1,6 @@
 """Words: split a prompt into words, and look up which of them the grammar knows."""
 
+import re
 import unicodedata
 from functools import cache
 
@@ -30,18 +31,15 @@ COMPOUNDS = {
     ("sail", "boat"): "boat",
 }
 IRREGULAR_PLURALS = {"tori": "torus", "boxes": "box", "arches": "arch"}
-VARIATION_SELECTORS = range(0xFE00, 0xFE10)  # they choose how an emoji is drawn
+WORD = re.compile(r"[^\W_]+(?:'s\b)?", re.IGNORECASE)
 
 
 def typed_words(prompt: str) -> list[str]:
     """Return the words of a prompt as they were typed.
 
-    A word is made of letters and digits of any script. Everything else separates words, except the marks that
-    belong to a letter, and an apostrophe before a final s.
+    A word is made of letters and digits of any script, and may end in an apostrophe and an s.
     """
-    text = unicodedata.normalize("NFC", prompt)
-    words = "".join(letter if _belongs_to_word(text, i) else " " for i, letter in enumerate(text)).split()
-    return [word for word in words if any(letter.isalnum() for letter in word)]
+    return WORD.findall(unicodedata.normalize("NFC", prompt))
 
 
 def words_of(prompt: str) -> list[str]:
@@ -98,13 +96,3 @@ def is_plural(word: str) -> bool:
 @cache
 def _nouns() -> frozenset[str]:
     return frozenset({*known_primitives(), *known_objects()})
-
-
-def _belongs_to_word(text: str, i: int) -> bool:
-    """Return whether the character at ``i`` is part of a word."""
-    letter = text[i]
-    if letter == "'":
-        behind = text[i + 1 : i + 3].lower()
-        return text[i - 1 : i].isalnum() and behind[:1] == "s" and not behind[1:].isalnum()
-    is_mark = unicodedata.category(letter) in ("Mn", "Mc") and ord(letter) not in VARIATION_SELECTORS
-    return letter.isalnum() or is_mark
