@@ -1,9 +1,8 @@
 """Charts of a run: what a run declared and logged, drawn as small SVG pictures.
 
-Every run has the charts of ``COMMON``; the others are those that its densifier and its objective declare.
-Numbers that belong to none of them get a plain chart each, so nothing that was logged is hidden. All pictures
-have the same size and margins, so that they line up on the page, which writes the title, the caption and the
-legend of each.
+Every run has charts of its Gaussians, its loss, its refinements and its opacity resets; the others are those
+that its densifier and its objective declare. All pictures have the same size and margins, so that they line
+up on the page, which writes the title, the caption and the legend of each.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,9 +31,6 @@ RESETS = Chart(
     caption="Gaussians whose opacity each reset lowered.",
     curves=(Curve(key="reset"),),
 )
-# Keys that these charts show already, or that are not numbers to draw.
-COMMON = (GAUSSIANS, LOSS, REFINEMENTS, RESETS)
-NOT_DRAWN = ("kind", "step", "seconds", "before", "after", "selected")
 
 DPI = 72  # one pixel of matplotlib is then one unit of the SVG
 WIDTH, HEIGHT = 560, 250  # units; the picture scales with the page
@@ -78,18 +74,6 @@ def sections(metrics: Lines, charts: Sequence[Chart]) -> dict[str, list[DrawnCha
     found = {"Growth": growth, "Densifier": by_densifier, "Objective": by_objective}
     filled = {title: [each for each in drawn if each is not None] for title, drawn in found.items()}
     return {title: drawn for title, drawn in filled.items() if drawn}
-
-
-def other_charts(metrics: Lines, charts: Sequence[Chart]) -> list[DrawnChart]:
-    """Return one plain chart for each number that was logged and that no other chart of the page shows."""
-    shown = {*NOT_DRAWN, *(key for chart in (*COMMON, *charts) for key in _keys(chart))}
-    found = []
-    for lines in lines_of(metrics):
-        for key in dict.fromkeys(key for line in lines for key in line):
-            chart = Chart(title=key, caption="", curves=(Curve(key=key),))
-            if key not in shown and (drawn := draw(chart, lines, _last_step(metrics))) is not None:
-                found.append(drawn)
-    return found
 
 
 def lines_of(metrics: Lines) -> tuple[list[Mapping[str, Any]], list[Mapping[str, Any]]]:

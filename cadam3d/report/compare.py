@@ -95,11 +95,6 @@ def mean(values: Mapping[str, float]) -> Mean | None:
     return Mean(float(np.mean(numbers)), _half(numbers), len(numbers))
 
 
-def difference(ours: Mapping[str, float], theirs: Mapping[str, float]) -> Mean | None:
-    """Return the mean of ``ours`` minus ``theirs`` over the prompts that both have; None without any."""
-    return mean({prompt: ours[prompt] - theirs[prompt] for prompt in ours.keys() & theirs.keys()})
-
-
 def change(ours: Mapping[str, float], theirs: Mapping[str, float]) -> Mean | None:
     """Return the mean of ``ours`` over the mean of ``theirs``, minus 1, over the prompts that both have.
 
@@ -129,56 +124,41 @@ def _half(values: Sequence[float]) -> float | None:
 
 
 @dataclass(frozen=True)
-class Pair:
-    """The results of two settings in one cell."""
-
-    cell: Cell
-    ours: JobResult
-    theirs: JobResult
-
-    @property
-    def count(self) -> float:
-        """Return by how many percent our count exceeds theirs; -90 means that a tenth of theirs remains."""
-        assert self.ours.count is not None
-        assert self.theirs.count
-        return 100 * (self.ours.count / self.theirs.count - 1)
-
-    def difference(self, value: Value) -> float | None:
-        """Return our value minus theirs; None if either is unknown."""
-        ours, theirs = value(self.ours), value(self.theirs)
-        return None if ours is None or theirs is None else ours - theirs
-
-
-@dataclass(frozen=True)
 class PairedComparison:
     """Two settings in all cells that have both."""
 
     ours: ArmSetting
     theirs: ArmSetting
-    pairs: list[Pair]  # at least one
+    pairs: list[tuple[JobResult, JobResult]]  # ours and theirs in one cell; at least one pair
     unpaired: int  # cells in which only one of the two left something to measure
 
     @property
     def count(self) -> Estimate:
-        """Return the relative difference of the counts, in percent."""
-        return Estimate.of({pair.cell: pair.count for pair in self.pairs})
+        """Return by how many percent our count exceeds theirs; -90 means that a tenth of theirs remains."""
+        return Estimate.of(
+            {ours.cell: 100 * ((ours.count or 0) / (theirs.count or 1) - 1) for ours, theirs in self.pairs}
+        )
 
     @property
     def early(self) -> int:
         """Return the number of cells in which one of the two stopped before its last step."""
-        return sum(pair.ours.ended_early or pair.theirs.ended_early for pair in self.pairs)
+        return sum(ours.ended_early or theirs.ended_early for ours, theirs in self.pairs)
+
+    def differences(self, value: Value) -> dict[Cell, float]:
+        """Return our value minus theirs in each cell in which both have it."""
+        found = {ours.cell: (value(ours), value(theirs)) for ours, theirs in self.pairs}
+        return {cell: a - b for cell, (a, b) in found.items() if a is not None and b is not None}
 
     def difference(self, value: Value) -> Estimate | None:
         """Return the difference of a value over the cells in which both have it; None without such a cell."""
-        found = {pair.cell: pair.difference(value) for pair in self.pairs}
-        known = {cell: number for cell, number in found.items() if number is not None}
-        return Estimate.of(known) if known else None
+        found = self.differences(value)
+        return Estimate.of(found) if found else None
 
 
 def compare(results: Sequence[JobResult], ours: ArmSetting, theirs: ArmSetting) -> PairedComparison | None:
     """Compare two settings cell by cell; ``None`` if no cell has both."""
     of_ours, of_theirs = by_cell(results, ours), by_cell(results, theirs)
-    pairs = [Pair(cell, of_ours[cell], of_theirs[cell]) for cell in sorted(of_ours.keys() & of_theirs.keys())]
+    pairs = [(of_ours[cell], of_theirs[cell]) for cell in sorted(of_ours.keys() & of_theirs.keys())]
     if not pairs:
         return None
     return PairedComparison(ours, theirs, pairs, len(of_ours.keys() ^ of_theirs.keys()))

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from cadam3d.io.atomic import replacing
 from cadam3d.io.run_folder import PAPER_TABLE_CSV, PAPER_TABLE_LATEX, PAPER_TABLE_MARKDOWN
-from cadam3d.report.paper_table import PaperTable, TableCell, TablePart, TableRow, paper_table
+from cadam3d.report.paper_table import PaperTable, TableCell, TableRow, paper_table
 from cadam3d.report.results import read
 from cadam3d.sweep.folder import read_plan
 
-FIRST = ("objective", "method", "source", "prompts")
+FIRST = ("category", "objective", "method", "source", "prompts")
 ALL = "all prompts"
 ARROWS = {True: "↑", False: "↓", None: ""}
 # Characters with a meaning in LaTeX, or that its fonts lack.
@@ -32,31 +32,40 @@ LATEX = {
 
 def headings(table: PaperTable) -> list[str]:
     """Return the titles of all columns, with an arrow towards the better numbers."""
-    return [*FIRST, *(f"{each.heading} {ARROWS[each.is_more_better]}".strip() for each in table.numbers)]
+    titles = [f"{each.heading} {ARROWS[each.is_more_better]}".strip() for each in table.numbers]
+    return [*_first(table), *titles]
 
 
-def texts(row: TableRow) -> list[str]:
-    """Return the text of every cell of a row, for readers."""
-    return [row.objective, row.method, row.source, row.prompts, *(text(cell, row) for cell in row.cells)]
+def texts(table: PaperTable) -> list[list[str]]:
+    """Return the text of every cell of every row, for readers."""
+    return [
+        [_beginning(row)[name] for name in _first(table)] + [text(cell, row) for cell in row.cells]
+        for row in table.rows
+    ]
+
+
+def _first(table: PaperTable) -> list[str]:
+    """Return the titles of the columns before the numbers; without categories there is no column of them."""
+    return [name for name in FIRST if name != "category" or any(row.category for row in table.rows)]
+
+
+def _beginning(row: TableRow) -> dict[str, str]:
+    values = (row.category or ALL, row.objective, row.method, row.source, row.prompts)
+    return dict(zip(FIRST, values, strict=True))
 
 
 def text(cell: TableCell, row: TableRow) -> str:
     """Return the text of a number with its interval, and how many prompts it has if other than its row."""
-    interval = f" ± {cell.shown_half}" if cell.half else ""
+    interval = f" ± {cell.half}" if cell.half else ""
     is_other = cell.prompts is not None and str(cell.prompts) != row.prompts.partition(" ")[0]
-    return f"{cell.value}{interval}{f' ({cell.prompts})' if is_other else ''}"
+    return f"{cell.text}{interval}{f' ({cell.prompts})' if is_other else ''}"
 
 
 def markdown(table: PaperTable) -> str:
-    """Return the table as Markdown, one part for all prompts and one for each category."""
-    lines = []
-    for part in table.parts:
-        if len(table.parts) > 1:
-            lines += [f"**{_in_markdown(part.category or ALL)}**", ""]
-        lines += [_markdown_line(headings(table))]
-        lines += [_markdown_line([*["---"] * len(FIRST), *["---:"] * len(table.numbers)])]
-        lines += [_markdown_line(texts(row)) for row in part.rows] + [""]
-    return "\n".join([*lines, *(f"- {' '.join(note.split())}" for note in table.notes)]) + "\n"
+    """Return the table as Markdown, with its notes as a list."""
+    rule = [*["---"] * len(_first(table)), *["---:"] * len(table.numbers)]
+    rows = [_markdown_line(headings(table)), f"| {' | '.join(rule)} |", *map(_markdown_line, texts(table))]
+    return "\n".join([*rows, "", *(f"- {' '.join(note.split())}" for note in table.notes)]) + "\n"
 
 
 def comma_separated(table: PaperTable) -> str:
@@ -64,34 +73,34 @@ def comma_separated(table: PaperTable) -> str:
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     titles = [number.heading for number in table.numbers]
-    columns = [column for title in titles for column in (title, f"{title}: ±", f"{title}: prompts")]
-    writer.writerow(["category", *FIRST, *columns])
-    for part in table.parts:
-        for row in part.rows:
-            numbers = [entry for cell in row.cells for entry in (cell.text, cell.half, cell.prompts)]
-            writer.writerow(
-                [part.category or ALL, row.objective, row.method, row.source, row.prompts, *numbers]
-            )
+    writer.writerow(
+        [*FIRST, *(each for title in titles for each in (title, f"{title}: ±", f"{title}: prompts"))]
+    )
+    for row in table.rows:
+        numbers = [
+            entry for cell in row.cells for entry in (_plain(cell.text), _plain(cell.half), cell.prompts)
+        ]
+        writer.writerow([*_beginning(row).values(), *numbers])
     return file.getvalue()
 
 
+def _plain(number: str) -> str:
+    """Return a number without separators of thousands."""
+    return number.replace(",", "")
+
+
 def latex(table: PaperTable) -> str:
-    """Return the table as LaTeX that needs no package; the parts follow each other in one file."""
-    parts = [_latex_part(table, part) for part in table.parts]
-    notes = "\n".join(f"% {' '.join(note.split())}" for note in table.notes)
-    return "\n".join([*parts, notes]) + "\n"
-
-
-def _latex_part(table: PaperTable, part: TablePart) -> str:
+    """Return the table as LaTeX that needs no package, with a line above each objective."""
     lines = [r"\begin{table}", r"\centering"]
-    lines += [rf"\caption{{{in_latex(part.category or ALL)}}}"]
-    lines += [rf"\begin{{tabular}}{{{'l' * len(FIRST)}{'r' * len(table.numbers)}}}", r"\hline"]
-    lines += [_latex_line(headings(table)), r"\hline"]
-    for position, row in enumerate(part.rows):
-        if position and row.objective != part.rows[position - 1].objective:
-            lines.append(r"\hline")
-        lines.append(_latex_line(texts(row)))
-    return "\n".join([*lines, r"\hline", r"\end{tabular}", r"\end{table}", ""])
+    lines += [rf"\begin{{tabular}}{{{'l' * len(_first(table))}{'r' * len(table.numbers)}}}", r"\hline"]
+    lines += [_latex_line(headings(table))]
+    before = None
+    for row, cells in zip(table.rows, texts(table), strict=True):
+        lines += [r"\hline"] if before != (row.category, row.objective) else []
+        before = (row.category, row.objective)
+        lines.append(_latex_line(cells))
+    notes = [f"% {' '.join(note.split())}" for note in table.notes]
+    return "\n".join([*lines, r"\hline", r"\end{tabular}", r"\end{table}", *notes]) + "\n"
 
 
 def in_latex(plain: str) -> str:
@@ -104,7 +113,7 @@ def _latex_line(cells: Sequence[str]) -> str:
 
 
 def _markdown_line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cell if set(cell) <= set('-:') else _in_markdown(cell) for cell in cells)} |"
+    return f"| {' | '.join(map(_in_markdown, cells))} |"
 
 
 def _in_markdown(plain: str) -> str:

@@ -6,13 +6,13 @@ table.
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from cadam3d.core.number import Number
 from cadam3d.io import records
 from cadam3d.io.run_folder import setting_word, shown
-from cadam3d.report.compare import Mean, change, difference, main_setting, mean, references
+from cadam3d.report.compare import Mean, change, main_setting, mean, references
 from cadam3d.report.formatting import plural
 from cadam3d.report.published import ROWS, SCORES, SIZES, PublishedRow
 from cadam3d.report.results import (
@@ -33,22 +33,11 @@ MISSING = "-"
 
 @dataclass(frozen=True)
 class TableCell:
-    """A number of the table as text, without separators of thousands."""
+    """A number of the table as text."""
 
     text: str = MISSING
     half: str = ""  # half the width of its 95 % interval; empty if there is none
     prompts: int | None = None  # how many prompts it was measured on; None for a published number
-
-    @property
-    def value(self) -> str:
-        """Return the number for readers, such as ``12,345``."""
-        whole, point, rest = self.text.partition(".")
-        return f"{int(whole):,}{point}{rest}" if whole.isdigit() and len(whole) > 3 else self.text
-
-    @property
-    def shown_half(self) -> str:
-        """Return half the width for readers."""
-        return TableCell(self.half).value if self.half else ""
 
 
 @dataclass(frozen=True)
@@ -60,22 +49,15 @@ class TableRow:
     source: str  # MINE or PUBLISHED
     prompts: str  # how many have a result, such as "49 of 50"; empty for a published row
     cells: list[TableCell]  # one for each number of the table
-
-
-@dataclass(frozen=True)
-class TablePart:
-    """The rows of all prompts, or of the prompts of one category."""
-
-    category: str  # empty: all prompts
-    rows: list[TableRow]
+    category: str = ""  # of its prompts; empty: all prompts
 
 
 @dataclass(frozen=True)
 class PaperTable:
-    """The paper's table 1 of a sweep."""
+    """The paper's table 1 of a sweep: the rows of all prompts, and then those of each category."""
 
     numbers: list[Number]  # one for each column
-    parts: list[TablePart]
+    rows: list[TableRow]
     notes: list[str]  # sentences below it
 
 
@@ -107,15 +89,16 @@ def paper_table(results: Sequence[JobResult], folder: Path) -> PaperTable | None
     left_out = mixed(usable)
     numbers = [number for number in columns(usable) if number.name not in left_out]
     categories = [each for each in dict.fromkeys(result.category for result in results) if each]
-    parts = [TablePart("", _rows(results, numbers, with_published=True))]
+    rows = _rows(results, numbers, with_published=True)
     for category in categories:
         members = [result for result in results if result.category == category]
-        parts.append(TablePart(category, _rows(members, numbers, with_published=False)))
+        own = _rows(members, numbers, with_published=False)
+        rows += [replace(row, category=category) for row in own]
     notes = [*_notes(results, usable, numbers), *_again(left_out, usable, folder)]
     papers = [number.name for number in SCORES]
     if not any(name in result.numbers for result in usable for name in papers):
         notes.append(f"The paper's scores are not measured yet. Try: {_line(papers, folder)}")
-    return PaperTable(numbers, parts, notes)
+    return PaperTable(numbers, rows, notes)
 
 
 def columns(results: Sequence[JobResult]) -> list[Number]:
@@ -239,7 +222,8 @@ def _difference(ours: Sequence[JobResult], theirs: Sequence[JobResult], number: 
     first, second = (_by_prompt([jobs[cell] for cell in shared], number.name) for jobs in having)
     if number in SIZES:
         return _change_cell(change(first, second))
-    return _cell(difference(first, second), number.digits, signed=True)
+    differences = {prompt: first[prompt] - second[prompt] for prompt in first}
+    return _cell(mean(differences), number.digits, signed=True)
 
 
 def _published_rows(family: str, numbers: Sequence[Number]) -> list[TableRow]:
@@ -277,16 +261,15 @@ def _published_difference(ours: PublishedRow, theirs: PublishedRow, name: str) -
 def _cell(found: Mean | None, digits: int, *, signed: bool = False) -> TableCell:
     if found is None:
         return TableCell()
-    half = "" if found.half is None else f"{found.half:.{digits}f}"
-    return TableCell(f"{found.value:{'+' if signed else ''}.{digits}f}", half, found.prompts)
+    half = "" if found.half is None else f"{found.half:,.{digits}f}"
+    return TableCell(f"{found.value:{'+' if signed else ''},.{digits}f}", half, found.prompts)
 
 
 def _change_cell(found: Mean | None) -> TableCell:
     if found is None:
         return TableCell()
-    word = "more" if found.value > 0 else "fewer"
     half = "" if found.half is None else f"{100 * found.half:.1f}"
-    return TableCell(f"{100 * abs(found.value):.1f} % {word}", half, found.prompts)
+    return TableCell(f"{100 * found.value:+.1f} %", half, found.prompts)
 
 
 def _by_prompt(jobs: Iterable[JobResult], name: str) -> dict[str, float]:
@@ -312,7 +295,7 @@ def _notes(results: Sequence[JobResult], usable: Sequence[JobResult], numbers: S
     notes = [
         f"Means over prompts{each}; after ±, half the width of the 95 % interval over prompts (Student's t).",
         "Rows of differences compare the same prompts and seeds under both arms. Gaussians and sizes are "
-        "compared by their means, as in the paper: 90 % fewer means that the mean is a tenth.",
+        "compared by their means, as in the paper: -90 % means that the mean is a tenth.",
     ]
     names = {number.name for number in numbers}
     scores = [score for job in usable for name, score in job.scores.items() if name in names]

@@ -231,29 +231,15 @@ def _pair(line: str) -> tuple[str, Any]:
     return override.get_key_element().lstrip("+~"), override.value()
 
 
-@dataclass(frozen=True)
-class Histogram:
-    """One score of one population: bin ``i`` starts at ``10 ** ((first + i) / bins_per_decade)``."""
+def histograms(result: JobResult, score: str | None = None) -> list[dict[str, Any]]:
+    """Return the lines of ``histograms.jsonl`` about one score; [] without the candidates callback.
 
-    step: float
-    bins_per_decade: int
-    first: int
-    counts: list[int]
-    selected: list[int]
-
-
-def histograms(result: JobResult, score: str | None = None) -> list[Histogram]:
-    """Return the histograms of one score by step; [] if the job ran without the candidates callback.
-
-    ``None`` stands for the first score in the file, because all scores count the same population.
+    Bin ``i`` of a line starts at ``10 ** ((first + i) / bins_per_decade)``. ``None`` stands for the first
+    score in the file, because all scores count the same population.
     """
     lines = read_histograms(result.folder)
     score = lines[0].get("score") if lines and score is None else score
-    return [
-        Histogram(*(line[key] for key in ("step", "bins_per_decade", "first", "counts", "selected")))
-        for line in lines
-        if line.get("score") == score
-    ]
+    return [line for line in lines if line.get("score") == score]
 
 
 def config(result: JobResult) -> dict[str, Any]:

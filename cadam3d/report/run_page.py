@@ -8,7 +8,7 @@ from cadam3d.core.chart import Chart
 from cadam3d.io.html import data_url, source
 from cadam3d.io.records import MEASUREMENTS, NUMBERS, declared
 from cadam3d.io.run_folder import ASSET, CONFIG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE
-from cadam3d.report.charts import lines_of, other_charts, sections
+from cadam3d.report.charts import lines_of, sections
 from cadam3d.report.declarations import write_declarations
 from cadam3d.report.formatting import elapsed, number, shown_bytes
 from cadam3d.report.growth import frames
@@ -72,7 +72,6 @@ def write(
         view_style=style(),
         view_script=f"{script()}{source(TEMPLATES / 'growth.js')}",
         sections=sections(metrics, charts),
-        other_charts=other_charts(metrics, charts),
         facts=_facts(summary),
         refinements=table([{k: v for k, v in line.items() if k != "kind"} for line in refinements]),
         config_text=config_text,
@@ -82,31 +81,21 @@ def write(
 
 def _tiles(summary: Mapping[str, Any]) -> list[Tile]:
     """Return the numbers that matter most, as far as they are known."""
-    numbers = {name: number(value) for name, value in summary.items()}
-    count, initial, size = (
-        numbers.get(name) for name in ("num_gaussians", "num_gaussians_initial", "asset_bytes")
-    )
-    done, asked, seconds = (numbers.get(name) for name in ("steps", "steps_asked", "seconds"))
+    found = {name: value for name in summary if (value := number(summary[name])) is not None}
     tiles = []
-    if count is not None:
+    if (count := found.get("num_gaussians")) is not None:
+        initial = found.get("num_gaussians_initial")
         tiles.append(Tile("Gaussians", f"{count:,.0f}", "" if initial is None else f"from {initial:,.0f}"))
-    known = declared(summary)
-    preferred = sorted(
-        (each.preference, not each.replaces, name)
-        for name, each in known.items()
-        if each.preference is not None and numbers.get(name) is not None
-    )
-    for _, _, name in preferred[:1]:
-        start = numbers.get(f"{name}_start")
-        remark = "" if start is None else f"{known[name].written(start)} at the start"
-        tiles.append(Tile(known[name].label, known[name].written(numbers[name] or 0.0), remark))
-    if size is not None:
-        tiles.append(Tile(ASSET, shown_bytes(size), f"{size / count:.0f} B per Gaussian" if count else ""))
-    if seconds is not None:
-        rate = f"{done / seconds:.1f} steps per second" if done and seconds else ""
-        tiles.append(Tile("Time", elapsed(seconds), rate))
-    if done is not None and len(tiles) < 4:
-        tiles.append(Tile("Steps", f"{done:,.0f}", f"of {asked:,.0f}" if asked is not None else ""))
+    preferred = [
+        each for each in declared(summary).values() if each.preference is not None and each.name in found
+    ]
+    for each in sorted(preferred, key=lambda each: (each.preference, not each.replaces))[:1]:
+        tiles.append(Tile(each.label, each.written(found[each.name]), ""))
+    if (size := found.get("asset_bytes")) is not None:
+        tiles.append(Tile(ASSET, shown_bytes(size), ""))
+    if (seconds := found.get("seconds")) is not None:
+        steps = found.get("steps")
+        tiles.append(Tile("Time", elapsed(seconds), f"{steps:,.0f} steps" if steps else ""))
     return tiles
 
 

@@ -48,23 +48,24 @@ class ScoreMap:
     @classmethod
     def of(cls, results: Sequence[JobResult], score: str) -> "ScoreMap | None":
         """Return the map of a score over jobs; None if none of them has its histograms."""
-        lines = [line for result in results for line in histograms(result, score) if sum(line.counts)]
-        lines = [line for line in lines if line.bins_per_decade == lines[0].bins_per_decade]
+        lines = [line for result in results for line in histograms(result, score) if sum(line["counts"])]
+        lines = [line for line in lines if line["bins_per_decade"] == lines[0]["bins_per_decade"]]
         if not lines:
             return None
-        bins = range(min(line.first for line in lines), max(line.first + len(line.counts) for line in lines))
+        first = min(line["first"] for line in lines)
+        bins = max(line["first"] + len(line["counts"]) for line in lines) - first
         by_step = defaultdict(list)
         for line in lines:
-            share = np.zeros(len(bins))
-            share[line.first - bins[0] :][: len(line.counts)] = np.array(line.counts) / sum(line.counts)
-            by_step[line.step].append(share)
+            share, at = np.zeros(bins), line["first"] - first
+            share[at : at + len(line["counts"])] = np.array(line["counts"]) / sum(line["counts"])
+            by_step[line["step"]].append(share)
         steps = sorted(by_step)
         declared = next(
             (each.levels for each in read_declarations(results[0].folder) if each.score == score), ()
         )
         return cls(
             steps=steps,
-            edges=10 ** (np.arange(bins[0], bins[-1] + 2) / lines[0].bins_per_decade),
+            edges=10 ** ((first + np.arange(bins + 1)) / lines[0]["bins_per_decade"]),
             shares=np.stack([np.mean(by_step[step], axis=0) for step in steps], axis=1),
             levels=[level for level in declared if level.value > 0],
         )

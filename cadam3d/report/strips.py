@@ -54,7 +54,10 @@ def masks_figure(results: Sequence[JobResult]) -> Figure | None:
     lines = {}
     for result in members:
         pictures = candidate_pictures(result)
-        chosen = {each.step: f"{sum(each.selected):,} of {sum(each.counts):,}" for each in histograms(result)}
+        chosen = {
+            each["step"]: f"{sum(each['selected']):,} of {sum(each['counts']):,}"
+            for each in histograms(result)
+        }
         lines[result.arm] = [
             ShownPicture(
                 mask_of(read_png(pictures[step])) if step in pictures else None,

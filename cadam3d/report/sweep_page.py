@@ -107,11 +107,11 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None, baseline: str 
     kinds |= _frontiers(results)
     folder = sweep_folder / FIGURES
     comparison = tables.comparison_table(results, baseline)
-    settings = tables.medians_table(results)
+    medians = tables.medians_table(results)
     tables.write_csv(folder / "comparison.csv", comparison)
-    tables.write_csv(folder / "medians.csv", settings)
+    tables.write_csv(folder / "medians.csv", medians)
     drawn = [_drawn(results, name, kinds[name], folder) for name in chosen if name in kinds]
-    main = tables.medians_table(results, only_main=True)
+    paper = read_table(sweep_folder)
     return write_page(
         sweep_folder / REPORT,
         "sweep.html.jinja",
@@ -121,10 +121,10 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None, baseline: str 
         warnings=_unknown(chosen, kinds),
         choice=_choice(sweep_folder, plan),
         comparison=table(tables.as_texts(comparison, results)),
-        paper_table=_shown(read_table(sweep_folder)),
-        medians=table(main, align_decimals=True),
+        paper_table=_shown(paper),
+        paper_notes=[] if paper is None else paper.notes,
+        medians=table(medians, align_decimals=True),
         figures=[figure for figure in drawn if figure is not None],
-        settings=table(settings if len(settings) > len(main) else [], align_decimals=True),
         early=[each for each in results if each.outcome != Outcome.FINISHED and not each.is_unfinished],
         waiting=sum(result.is_unfinished for result in results),
         jobs=table(tables.jobs_table(results), link="job", align_decimals=True),
@@ -145,22 +145,14 @@ def _choice(folder: Path, plan: Plan) -> str:
     return reason if isinstance(reason, str) else ""
 
 
-def _shown(found: PaperTable | None) -> tuple[list[tuple[str, Table]], list[str]] | None:
-    """Return the parts of the paper's table with their categories, if there are several, and its notes."""
+def _shown(found: PaperTable | None) -> Table:
+    """Return the paper's table as a part of the page; it is empty if there is none."""
     if found is None:
-        return None
-    titles = [
-        Column(title, is_text=position < len(paper_formats.FIRST), is_link=False)
-        for position, title in enumerate(paper_formats.headings(found))
-    ]
-    parts = [
-        (
-            (part.category or paper_formats.ALL) if len(found.parts) > 1 else "",
-            Table(titles, [paper_formats.texts(row) for row in part.rows]),
-        )
-        for part in found.parts
-    ]
-    return parts, found.notes
+        return Table([], [])
+    titles = paper_formats.headings(found)
+    texts = len(titles) - len(found.numbers)
+    columns = [Column(title, is_text=i < texts, is_link=False) for i, title in enumerate(titles)]
+    return Table(columns, paper_formats.texts(found))
 
 
 def _kinds(results: Sequence[JobResult]) -> dict[str, FigureKind]:

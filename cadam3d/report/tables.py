@@ -70,16 +70,8 @@ def _difference(results: Sequence[JobResult], setting: ArmSetting, arm: str) -> 
         above = above_frontier(results, setting, arm, value_of(quality))
         if len(settings_of(results, arm)) > 1:
             line[f"{quality.heading} at equal count"] = Estimate.of(above) if above else None
-        line[f"{quality.heading} over seeds"] = _rounded(
-            over_seeds(
-                {
-                    pair.cell: difference
-                    for pair in found.pairs
-                    if (difference := pair.difference(value_of(quality))) is not None
-                }
-            ),
-            quality.digits,
-        )
+        spread = over_seeds(found.differences(value_of(quality)))
+        line[f"{quality.heading} over seeds"] = _rounded(spread, quality.digits)
     return line | {"unpaired": found.unpaired or None, "ended early": found.early or None}
 
 
@@ -94,21 +86,15 @@ def as_texts(lines: Sequence[Line], results: Sequence[JobResult]) -> list[Line]:
     return [{key: text(key, value) for key, value in line.items()} for line in lines]
 
 
-def medians_table(results: Sequence[JobResult], *, only_main: bool = False) -> list[Line]:
-    """Return medians over cells of every setting by objective and noise (paper table 1).
-
-    With ``only_main``, each arm has its main setting only.
-    """
+def medians_table(results: Sequence[JobResult]) -> list[Line]:
+    """Return medians over cells of every setting by objective and noise (paper table 1)."""
     lines, axis, numbers = [], objective_axis(results), _compared(results)
-    main = {arm: main_setting(results, arm) for arm in arms_of(results)}
     for objective in sorted({result.cell[axis] for result in measured(results)}):
         of_objective = [result for result in results if result.cell[axis] == objective]
         for level in levels_of(of_objective):
             here = at_noise(of_objective, level)
-            settings = [each for arm in arms_of(here) for each in settings_of(here, arm)]
-            for setting in settings:
-                if not only_main or setting == main[setting.arm]:
-                    lines.append({"objective": objective, "noise": level, **_medians(here, setting, numbers)})
+            for setting in (each for arm in arms_of(here) for each in settings_of(here, arm)):
+                lines.append({"objective": objective, "noise": level, **_medians(here, setting, numbers)})
     return _without_empty(lines)
 
 

@@ -13,7 +13,7 @@ from declarations import all_numbers, declared
 from cadam3d import report
 from cadam3d.io import run_folder
 from cadam3d.report import paper_formats
-from cadam3d.report.compare import change, difference, mean
+from cadam3d.report.compare import change, mean
 from cadam3d.report.paper_formats import comma_separated, headings, in_latex, latex, markdown, texts
 from cadam3d.report.paper_table import columns, paper_table
 from cadam3d.report.published import ROWS, SCORES, SIZES
@@ -66,11 +66,12 @@ def cell_of(table, row, name):
     return row.cells[[number.name for number in table.numbers].index(name)]
 
 
-def row_of(table, objective, method, source="this sweep", part=0):
+def row_of(table, objective, method, source="this sweep", category=""):
     found = [
         row
-        for row in table.parts[part].rows
-        if (row.objective.partition(",")[0], row.method, row.source) == (objective, method, source)
+        for row in table.rows
+        if row.category == category
+        and (row.objective.partition(",")[0], row.method, row.source) == (objective, method, source)
     ]
     assert len(found) == 1
     return found[0]
@@ -89,9 +90,9 @@ def test_the_published_numbers_are_those_of_the_source():
 def test_means_and_intervals_equal_those_computed_by_hand(three):
     table = table_of(three)
     baseline, cadam = row_of(table, "SDS", "baseline"), row_of(table, "SDS", "cadam")
-    assert cell_of(table, baseline, "num_gaussians").text == "2000"
+    assert cell_of(table, baseline, "num_gaussians").text == "2,000"
     # The standard deviation of 1000, 2000 and 3000 is 1000.
-    assert float(cell_of(table, baseline, "num_gaussians").half) == pytest.approx(
+    assert float(cell_of(table, baseline, "num_gaussians").half.replace(",", "")) == pytest.approx(
         T2 * 1000 / math.sqrt(3), abs=1
     )
     assert cell_of(table, cadam, "num_gaussians").text == "200"
@@ -106,7 +107,7 @@ def test_differences_are_paired_by_prompt(three):
     assert cell_of(table, row, "psnr").text == "-0.20"
     assert float(cell_of(table, row, "psnr").half) == pytest.approx(T2 * 0.1 / math.sqrt(3), abs=0.006)
     # 600 of 6,000 Gaussians remain. The residuals 100 - 100, 300 - 200 and 200 - 300 have a deviation of 100.
-    assert cell_of(table, row, "num_gaussians").text == "90.0 % fewer"
+    assert cell_of(table, row, "num_gaussians").text == "-90.0 %"
     half = 100 * T2 * 100 / math.sqrt(3) / 2000
     assert float(cell_of(table, row, "num_gaussians").half) == pytest.approx(half, abs=0.06)
 
@@ -117,7 +118,7 @@ def test_missing_jobs_are_counted_and_left_out_of_pairs(three):
     assert row_of(table, "VFDS", "cadam").prompts == "3"
     difference_row = row_of(table, "VFDS", "cadam - baseline")
     assert difference_row.prompts == "2 of 3"
-    assert cell_of(table, difference_row, "num_gaussians").text == "86.7 % fewer"
+    assert cell_of(table, difference_row, "num_gaussians").text == "-86.7 %"
     assert any("1 of 12 jobs" in note for note in table.notes)
 
 
@@ -156,35 +157,37 @@ def test_seeds_are_averaged_within_a_prompt_first(jobs):
 def test_published_rows_keep_their_text_and_never_share_a_cell(three):
     table = table_of(three)
     published = row_of(table, "VFDS", "cadam", "published")
-    assert cell_of(table, published, "num_gaussians").value == "82K"
-    assert cell_of(table, published, "asset_mib").value == "5.3MB"
+    assert cell_of(table, published, "num_gaussians").text == "82K"
+    assert cell_of(table, published, "asset_mib").text == "5.3MB"
     assert cell_of(table, published, "psnr").text == "-"
     assert (
         cell_of(table, row_of(table, "SDS", "cadam - baseline", "published"), "num_gaussians").text
-        == "86.6 % fewer"
+        == "-86.6 %"
     )
-    assert not any(row.source == "published" for part in table.parts[1:] for row in part.rows)
+    assert not any(row.source == "published" for row in table.rows if row.category)
     assert any("another protocol" in note for note in table.notes)
 
 
 def test_objectives_that_the_paper_lacks_have_no_published_rows(jobs):
     jobs.add("cadam", "guidance=gcs", n=10, psnr=20, arm="cadam")
     table = table_of(jobs.folder)
-    assert [row.source for row in table.parts[0].rows] == ["this sweep"]
+    assert [row.source for row in table.rows] == ["this sweep"]
     assert not any("published" in note for note in table.notes)
 
 
 def test_each_category_has_its_own_part(three):
     table = table_of(three)
-    assert [part.category for part in table.parts] == ["", "Material", "Structure & 100 %"]
-    assert cell_of(table, row_of(table, "SDS", "baseline", part=1), "num_gaussians").text == "1000"
-    assert cell_of(table, row_of(table, "SDS", "baseline", part=1), "num_gaussians").half == ""
-    assert row_of(table, "SDS", "baseline", part=2).prompts == "2"
+    assert list(dict.fromkeys(row.category for row in table.rows)) == ["", "Material", "Structure & 100 %"]
+    assert (
+        cell_of(table, row_of(table, "SDS", "baseline", category="Material"), "num_gaussians").text == "1,000"
+    )
+    assert cell_of(table, row_of(table, "SDS", "baseline", category="Material"), "num_gaussians").half == ""
+    assert row_of(table, "SDS", "baseline", category="Structure & 100 %").prompts == "2"
 
 
 def test_all_formats_show_the_same_cells(three):
     table = table_of(three)
-    wanted = [texts(row) for part in table.parts for row in part.rows]
+    wanted = texts(table)
 
     lines = [line for line in markdown(table).splitlines() if line.startswith("| ")]
     shown = [[cell.replace("\\", "") for cell in re.split(r" (?<!\\)\| ", line[2:-2])] for line in lines]
@@ -192,23 +195,23 @@ def test_all_formats_show_the_same_cells(three):
     assert body == wanted
 
     rows = list(csv.reader(io.StringIO(comma_separated(table))))
-    assert [row[1:5] for row in rows[1:]] == [line[:4] for line in wanted]
+    assert [row[:5] for row in rows[1:]] == [line[:5] for line in wanted]
     for row, line in zip(rows[1:], wanted, strict=True):
-        for i, cell in enumerate(line[4:]):
+        for i, cell in enumerate(line[5:]):
             number, half, prompts = row[5 + 3 * i : 8 + 3 * i]
             interval = f" ± {half}" if half else ""
-            own = f" ({prompts})" if prompts and prompts != line[3].partition(" ")[0] else ""
+            own = f" ({prompts})" if prompts and prompts != line[4].partition(" ")[0] else ""
             assert cell.replace(",", "") == f"{number}{interval}{own}"
 
     body = [line for line in latex(table).splitlines() if line.endswith(r"\\")]
-    assert len(body) == len(wanted) + len(table.parts)
+    assert len(body) == len(wanted) + 1
     for line in wanted:
         assert " & ".join(map(in_latex, line)) + r" \\" in body
 
 
 def test_the_latex_is_balanced_and_escapes_what_users_type(three):
     text = latex(table_of(three))
-    assert r"\caption{Structure \& 100 \%}" in text
+    assert r"Structure \& 100 \% &" in text
     code = "\n".join(line for line in text.splitlines() if not line.startswith("%"))
     bare = re.sub(r"\\[&%$#_{}\\]", "", code)
     depth = 0
@@ -230,9 +233,9 @@ def test_the_page_of_the_sweep_shows_the_table_with_escaped_text(three):
     plan["jobs"][0]["category"] = "<b>"
     (three / run_folder.JOBS).write_text(json.dumps({**plan, "figures": ["no such"]}))
     page = report.write_sweep(three).read_text(encoding="utf-8")
-    assert "<h3>&lt;b&gt;</h3>" in page
-    for row in table_of(three).parts[0].rows:
-        assert all(html.escape(cell) in page for cell in texts(row))
+    assert "&lt;b&gt;</td>" in page
+    for row in texts(table_of(three)):
+        assert all(html.escape(cell) in page for cell in row)
 
 
 def test_columns_are_the_numbers_that_every_row_has(jobs):
@@ -298,7 +301,7 @@ def test_a_table_without_scores_says_how_to_measure_them(jobs):
 def test_settings_that_come_with_prompts_do_not_split_the_rows(jobs):
     for prompt, negative in (("a cube", "blurry"), ("a torus", "ugly")):
         jobs.add("cadam", f"prompt={prompt}", f"negative_prompt={negative}", n=10, psnr=20, arm="cadam")
-    rows = [row for row in table_of(jobs.folder).parts[0].rows if row.source == "this sweep"]
+    rows = [row for row in table_of(jobs.folder).rows if row.source == "this sweep"]
     assert [(row.objective, row.prompts) for row in rows] == [("SDS", "2")]
 
 
@@ -329,7 +332,7 @@ def test_recipes_are_objectives(jobs):
     recipes = {"gaussiandreamer": "sds_gaussiandreamer", "flowdreamer": "vfds_flowdreamer"}
     for recipe, objective in recipes.items():
         jobs.add("cadam", f"experiment={recipe}", n=10, psnr=20, arm="cadam", guidance=objective)
-    labels = [row.objective for row in table_of(jobs.folder).parts[0].rows if row.source == "this sweep"]
+    labels = [row.objective for row in table_of(jobs.folder).rows if row.source == "this sweep"]
     assert labels == ["SDS, gaussiandreamer", "VFDS, flowdreamer"]
 
 
@@ -337,5 +340,5 @@ def test_a_single_prompt_has_no_interval_and_no_pair_no_difference():
     assert mean({"a": 3.0}) is not None
     assert mean({"a": 3.0}).half is None  # pyright: ignore[reportOptionalMemberAccess]
     assert mean({}) is None
-    assert difference({"a": 1.0}, {"b": 1.0}) is None
+    assert change({"a": 1.0}, {"b": 1.0}) is None
     assert change({"a": 1.0}, {"a": 0.0}) is None

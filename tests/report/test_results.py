@@ -169,7 +169,7 @@ def test_histograms_are_read_of_the_given_or_the_first_score(jobs):
     jobs.files(jobs.add("baseline", n=600, psnr=20.0), 600)
     result = read(jobs.folder)[0]
     assert histograms(result, "shake") == []
-    assert [line.step for line in histograms(result)] == [40, 80, 120]
+    assert [line["step"] for line in histograms(result)] == [40, 80, 120]
 
 
 def test_noise_levels_are_in_the_order_of_the_sweep(jobs):
