@@ -22,11 +22,11 @@ from cadam3d.build import build_trainer, component
 from cadam3d.callback.base import Callback
 from cadam3d.commands.beginning import run_context
 from cadam3d.core.cameras import orbit
+from cadam3d.core.palette import INK, LINE, PAPER, SOFT
 from cadam3d.core.render import RenderFn
 from cadam3d.io.atomic import replacing
 from cadam3d.io.caption import BOLD, REGULAR, font
 from cadam3d.io.image import to_uint8
-from cadam3d.report.palette import INK, LINE, PAPER, SOFT
 from cadam3d.report.style import looks
 from cadam3d.settings.compose import compose
 from cadam3d.state import RunContext, StepReport, TrainState

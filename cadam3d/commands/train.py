@@ -20,10 +20,10 @@ from cadam3d.core.checks import require_whole
 from cadam3d.core.console import say
 from cadam3d.core.device import resolve_device
 from cadam3d.initializer.base import Initializer
+from cadam3d.io.declarations import write_declarations
 from cadam3d.io.occupied import occupied
 from cadam3d.io.records import read_metrics
 from cadam3d.report import write_report
-from cadam3d.report.declarations import write_declarations
 from cadam3d.settings.compose import Call
 
 log = logging.getLogger(__name__)

@@ -9,12 +9,21 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from cadam3d.core import palette
+
 Color = tuple[int, int, int]
 
-# The colours of text in the reports (cadam3d/report/palette.py), on light and on dark paper.
-LIGHT = ((27, 28, 30), (93, 97, 103))  # title, detail
-DARK = ((235, 235, 232), (160, 165, 173))
-PAPER: Color = (255, 255, 255)
+
+def _rgb(color: str) -> Color:
+    """Return a colour such as ``#ffffff`` as three numbers from 0 to 255."""
+    red, green, blue = bytes.fromhex(color.removeprefix("#"))
+    return red, green, blue
+
+
+# The colours of a title and of a detail, on light and on dark paper.
+LIGHT = (_rgb(palette.INK), _rgb(palette.SOFT))
+DARK = (_rgb(palette.DARK[palette.INK]), _rgb(palette.DARK[palette.SOFT]))
+PAPER = _rgb(palette.PAPER)
 BOLD, REGULAR = "DejaVuSans-Bold.ttf", "DejaVuSans.ttf"
 # The size of letters as a share of the width of a picture, and its limits.
 SHARE = 1 / 18

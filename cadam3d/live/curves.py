@@ -7,11 +7,11 @@ from typing import Any
 
 from cadam3d.core.chart import Chart
 from cadam3d.core.errors import UserError
+from cadam3d.io.declarations import GAUSSIANS, LOSS
 from cadam3d.io.jsonl import is_number, parse_json
 from cadam3d.io.reading import open_contained, signature
 from cadam3d.io.records import is_metrics
 from cadam3d.io.run_folder import METRICS
-from cadam3d.report.declarations import GAUSSIANS, LOSS
 
 # Limits of what is kept in memory and of what is sent to a page.
 MOST_KEYS, MOST_POINTS, MOST_SENT = 200, 4096, 500

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO, Generic, TypeVar
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io import live
+from cadam3d.io.declarations import read_declarations
 from cadam3d.io.jsonl import is_whole
 from cadam3d.io.lock import holder_name, is_held
 from cadam3d.io.reading import open_contained, open_regular, signature
@@ -37,7 +38,6 @@ from cadam3d.io.run_folder import (
     shown,
 )
 from cadam3d.live.curves import Curves
-from cadam3d.report.declarations import read_declarations
 from cadam3d.viewer.pack import pack
 
 LARGEST_SNAPSHOT = 1 << 30  # bytes; ten million Gaussians of SH degree 3 have less

@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cadam3d.core.chart import Chart, Curve
-from cadam3d.report.declarations import GAUSSIANS, LOSS
+from cadam3d.core.palette import SERIES_COLORS, SOFT
+from cadam3d.io.declarations import GAUSSIANS, LOSS
 from cadam3d.report.formatting import number
-from cadam3d.report.palette import SERIES_COLORS, SOFT
 from cadam3d.report.style import inline, label_axis, styled, svg_of
 
 Point = tuple[float, float]

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from cadam3d.core.number import Number
+from cadam3d.core.palette import INK, PAPER
 from cadam3d.io.records import read_metrics
 from cadam3d.report.charts import Point, counts
 from cadam3d.report.compare import (
@@ -25,7 +26,6 @@ from cadam3d.report.compare import (
     qualities,
     value_of,
 )
-from cadam3d.report.palette import INK, PAPER
 from cadam3d.report.results import (
     ArmSetting,
     JobResult,

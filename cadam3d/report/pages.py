@@ -7,10 +7,10 @@ from typing import Any
 from urllib.parse import quote
 
 from cadam3d import __version__
+from cadam3d.core.palette import css
 from cadam3d.io.atomic import replacing
 from cadam3d.io.html import fill
 from cadam3d.report.formatting import show
-from cadam3d.report.palette import css
 
 TEMPLATES = Path(__file__).with_name("templates")
 GOOD, BAD = ("finished",), ("failed", "vanished")  # the other outcomes stopped early with an asset

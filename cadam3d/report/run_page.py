@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from cadam3d.core.chart import Chart
+from cadam3d.io.declarations import write_declarations
 from cadam3d.io.html import data_url, source
 from cadam3d.io.records import MEASUREMENTS, NUMBERS, declared
 from cadam3d.io.run_folder import ASSET, CONFIG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE
 from cadam3d.report.charts import lines_of, sections
-from cadam3d.report.declarations import write_declarations
 from cadam3d.report.formatting import elapsed, number, shown_bytes
 from cadam3d.report.growth import frames
 from cadam3d.report.pages import TEMPLATES, Tile, table, write_page

@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cadam3d.core.chart import Chart, Level
+from cadam3d.io.declarations import read_declarations
 from cadam3d.report.compare import by_cell, main_setting
-from cadam3d.report.declarations import read_declarations
 from cadam3d.report.results import JobResult, arms_of, at_noise, histograms, level_title, levels_of, measured
 from cadam3d.report.style import label_axis, new_figure
 

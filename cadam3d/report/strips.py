@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from cadam3d.core.palette import INK, SOFT
 from cadam3d.io.image import read_png, step_pictures
 from cadam3d.io.run_folder import CANDIDATES, PREVIEW
 from cadam3d.report.compare import by_cell, main_setting, qualities
-from cadam3d.report.palette import INK, SOFT
 from cadam3d.report.results import (
     NOISE,
     RECIPE,

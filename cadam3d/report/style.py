@@ -13,9 +13,9 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
+from cadam3d.core.palette import ARMS, INK, LINE, PAPER, SOFT, VARIABLES
 from cadam3d.io.atomic import replacing
 from cadam3d.report.formatting import short
-from cadam3d.report.palette import ARMS, INK, LINE, PAPER, SOFT, VARIABLES
 
 COLORS = tuple(ARMS)
 MARKERS = ("o", "s", "D", "^", "X", "P", "v", "<", ">", "p", "*", "d", "h")

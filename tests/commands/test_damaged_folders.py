@@ -21,11 +21,11 @@ import yaml
 from cadam3d import cli
 from cadam3d.core.errors import UserError
 from cadam3d.io.checkpoint import load_checkpoint
+from cadam3d.io.declarations import read_declarations
 from cadam3d.io.jsonl import truncate_after
 from cadam3d.io.ply import holds_gaussians, read_ply
 from cadam3d.io.reading import read_text
 from cadam3d.io.records import read_histograms, read_metrics, read_summary
-from cadam3d.report.declarations import read_declarations
 from cadam3d.settings.compose import load_config
 from cadam3d.settings.trust import read_overrides
 

@@ -14,7 +14,7 @@ from declarations import declared
 
 from cadam3d.core.chart import Chart, Curve, Level
 from cadam3d.io import run_folder
-from cadam3d.report.declarations import write_declarations
+from cadam3d.io.declarations import write_declarations
 from cadam3d.report.results import JobResult, read
 from cadam3d.sweep.folder import Job, Plan, write_plan
 

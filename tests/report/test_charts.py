@@ -6,8 +6,8 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from cadam3d.core.chart import Chart, Curve
+from cadam3d.core.palette import SERIES
 from cadam3d.report.charts import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, counts, draw
-from cadam3d.report.palette import SERIES
 
 
 def chart(**settings) -> Chart:

@@ -6,9 +6,9 @@ import re
 import numpy as np
 import pytest
 
+from cadam3d.core.palette import ARMS, DARK, css
 from cadam3d.report import figures, strips
 from cadam3d.report.compare import qualities
-from cadam3d.report.palette import ARMS, DARK, css
 from cadam3d.report.results import measured, read
 from cadam3d.report.style import inline, looks, styled, write_figure
 from cadam3d.report.sweep_page import KINDS

@@ -14,10 +14,10 @@ from cadam3d import report
 from cadam3d.build import component
 from cadam3d.core.chart import Chart, Curve
 from cadam3d.core.errors import UserError
+from cadam3d.core.palette import css
+from cadam3d.io.declarations import read_declarations
 from cadam3d.report import run_page, write_report
-from cadam3d.report.declarations import read_declarations
 from cadam3d.report.pages import TEMPLATES
-from cadam3d.report.palette import css
 from cadam3d.settings.compose import compose
 
 SUMMARY = {

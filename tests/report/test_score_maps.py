@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cadam3d.report.declarations import write_declarations
+from cadam3d.io.declarations import write_declarations
 from cadam3d.report.results import at_noise, read
 from cadam3d.report.score_maps import ScoreMap, declared_scores, score_figure
 from cadam3d.report.style import styled

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from cadam3d.core.chart import Chart, Curve, Level
-from cadam3d.report.declarations import read_declarations, write_declarations
+from cadam3d.io.declarations import read_declarations, write_declarations
 
 CHARTS = (
     Chart(

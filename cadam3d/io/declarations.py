@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from pydantic import TypeAdapter
-
 from cadam3d.core.chart import Chart, Curve
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json, write_json
@@ -36,6 +34,8 @@ def read_declarations(folder: Path) -> tuple[Chart, ...]:
         content = read_json(folder / CHARTS)
     except UserError:
         return ()
+    from pydantic import TypeAdapter  # takes a tenth of a second to load
+
     found, adapter = [], TypeAdapter(Chart)
     for entry in content if isinstance(content, list) else []:
         try:
