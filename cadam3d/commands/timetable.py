@@ -8,16 +8,13 @@ from cadam3d.densifier.base import Densifier
 from cadam3d.densifier.refine import Refine
 from cadam3d.trainer import Trainer
 
-# The default of ``steps``, which is long enough for every densifier with its default settings.
-USUAL_STEPS = 600
-
 
 def describe(trainer: Trainer) -> str:
     """Return the timetable of a run in one line: refinements, opacity resets, the steps after them, rates.
 
     It names resets that are skipped (:attr:`Refine.resets`) and schedules that the run does not complete. If
-    no Gaussian can grow, it says so and which settings change that. If the refinements are made for another
-    number of steps, it says what this run misses or adds.
+    no Gaussian can grow, it says so. If the refinements are made for another number of steps, it says how
+    many that length has.
     """
     refine, densifier = trainer.refine, trainer.densifier
     rest, settled = _rest(refine, densifier), trainer.optimizer.settled_at()
@@ -34,9 +31,15 @@ def describe(trainer: Trainer) -> str:
     if later := [f"{key} (until step {end})" for key, end in _schedules(trainer) if end > refine.steps]:
         sentences.append(f"The run ends before these schedules do: {', '.join(later)}.")
     if refine.made_for not in (None, refine.steps):
-        sentences.append(_difference(refine, replace(refine, steps=refine.made_for), densifier))
-    if densifier.grows_from is not None and not _grows(refine, densifier.grows_from):
-        sentences.append(_nothing_grows(refine, densifier.grows_from))
+        published = len(replace(refine, steps=refine.made_for).refinements)
+        sentences.append(f"The refinements are made for {refine.made_for} steps, which have {published}.")
+    if densifier.grows_from is not None and not any(
+        step >= densifier.grows_from for step in refine.refinements[-1:]
+    ):
+        sentences.append(
+            f"Nothing will grow, because no refinement follows step {densifier.grows_from}. "
+            f"Try: refine.start=0 refine.end={refine.steps}"
+        )
     return " ".join(sentences)
 
 
@@ -56,49 +59,6 @@ def _rest(refine: Refine, densifier: Densifier) -> int:
     """Return the number of steps after the last refinement and the last reset."""
     resets = refine.resets if densifier.resets else range(0)
     return refine.steps - max((*refine.refinements[-1:], *resets[-1:]), default=0)
-
-
-def _difference(refine: Refine, published: Refine, densifier: Densifier) -> str:
-    """Return what a run misses, or adds, compared with the length for which its refinements are made."""
-    lengths = f"The refinements are made for {published.steps} steps and do not follow the length of the run"
-    grown = len(refine.refinements) - len(published.refinements)
-    if refine.steps > published.steps:
-        return f"{lengths}: this run adds {_plural(grown, 'refinement')}."
-    missed = [
-        (-grown, f"of {_plural(len(published.refinements), 'refinement')}"),
-        (
-            densifier.resets * (len(published.resets) - len(refine.resets)),
-            f"of {_plural(len(published.resets), 'opacity reset')}",
-        ),
-        (
-            _rest(published, densifier) - _rest(refine, densifier),
-            f"of {_plural(_rest(published, densifier), 'step')} after them",
-        ),
-    ]
-    return (
-        f"{lengths}: this run misses {', '.join(f'{count} {what}' for count, what in missed if count > 0)}."
-    )
-
-
-def _grows(refine: Refine, grows_from: int) -> bool:
-    return any(step >= grows_from for step in refine.refinements[-1:])
-
-
-def _nothing_grows(refine: Refine, grows_from: int) -> str:
-    """Return that nothing will grow, why, and settings of the default schedule with which Gaussians grow."""
-    why = (
-        f"no Gaussian may grow before step {grows_from}"
-        if refine.refinements
-        else f"no multiple of refine.interval={refine.interval} is above refine.start={refine.start}, below "
-        f"refine.end={refine.end} and within the run"
-    )
-    steps = refine.steps
-    # The last refinement of the default schedule ends the eighth of twelve parts.
-    if steps // 12 * 8 < max(grows_from, 1):
-        steps = max(USUAL_STEPS, 2 * grows_from)
-    part = steps // 12
-    example = f"steps={steps} refine.start={2 * part} refine.end={9 * part} refine.interval={part}"
-    return f"Nothing will grow, because {why}. Try: {example}"
 
 
 def _schedules(trainer: Trainer) -> Iterator[tuple[str, int]]:
@@ -121,7 +81,3 @@ def _counted(noun: str, steps: range) -> str:
     if len(steps) == 2:
         return f"2 {noun}s (steps {steps[0]} and {steps[1]})"
     return f"{len(steps)} {noun}s (steps {steps[0]} to {steps[-1]}, every {steps.step})"
-
-
-def _plural(count: int, noun: str) -> str:
-    return f"{count or 'no'} {noun}{'' if count == 1 else 's'}"

@@ -1,4 +1,4 @@
-"""The line before training says what happens when, and what a recipe of another length misses."""
+"""The line before training says what happens when."""
 
 import pytest
 import torch
@@ -47,40 +47,26 @@ def test_a_densifier_that_claims_to_reset_nothing_marks_no_gaussian(name):
     assert not densifier.unreliable(state).any()
 
 
-def test_a_run_in_which_nothing_grows_says_which_settings_change_that():
-    growing = "Try: steps=600 refine.start=100 refine.end=450 refine.interval=50"
+def test_a_run_in_which_nothing_grows_says_so():
     for words in (["refine.start=450"], ["refine.interval=451"], ["refine.end=0"], ["steps=2"], ["steps=20"]):
-        text = line(*words)
-        assert "Nothing will grow" in text
-        assert text.endswith(growing)
-        assert "Nothing will grow" not in line(*words, *growing.removeprefix("Try: ").split())
-    hint = line("densifier.min_age=2000").partition("Try: ")[2]
-    assert "Nothing will grow" not in line("densifier.min_age=2000", *hint.split())
+        assert "Nothing will grow" in line(*words)
+    assert "Nothing will grow" in line("densifier.min_age=2000")
+    assert "Nothing will grow" not in line()
 
 
 def test_a_run_that_is_meant_not_to_grow_gets_no_advice():
     assert "Nothing will grow" not in line("densifier=none", "refine.end=0")
 
 
-def test_a_schedule_that_does_not_follow_the_length_says_what_a_shorter_run_misses():
+def test_a_schedule_that_does_not_follow_the_length_names_its_own():
     published = ["refine.made_for=5000", "refine.start=100", "refine.end=3000", "refine.interval=100"]
     published += ["refine.reset_interval=300", "refine.reset_from=500", "refine.reset_until=3000"]
     text = line("experiment=luciddreamer", "steps=600", *published, "guidance.t_max.steps=1500")
     assert (
         "5 refinements (steps 200 to 600, every 100), no opacity reset, 1 reset (step 600) is skipped" in text
     )
-    assert "made for 5000 steps" in text
-    assert "misses 23 of 28 refinements, 8 of 8 opacity resets, 2100 of 2100 steps after them" in text
+    assert "made for 5000 steps, which have 28." in text
     assert "guidance.t_max (until step 1500)" in text
-
-
-def test_a_schedule_that_does_not_follow_the_length_says_what_a_longer_run_adds():
-    fixed = ["refine.made_for=500", "refine.interval=50", "refine.end=3000"]
-    assert "made for 500 steps" in line("experiment=dreamgaussian", "steps=1000", *fixed)
-    assert "adds 10 refinements" in line("experiment=dreamgaussian", "steps=1000", *fixed)
-    assert "adds no refinements" in line(
-        "steps=2000", "refine.made_for=1200", "refine.end=900", "refine.interval=100"
-    )
 
 
 RECIPES = (

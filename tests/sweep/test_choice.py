@@ -191,12 +191,6 @@ def test_more_attempts_and_another_number_find_those_that_exist(train, calls):
     assert (folder / "best").readlink() == Path("seed=0")  # of equal ones
 
 
-def test_the_seeds_begin_with_the_one_of_the_line(train):
-    train("prompt=an attempt", "attempts=2", "seed=2", "hydra.run.dir=mine")
-    assert sorted(path.name for path in Path("mine").glob("seed=*")) == ["seed=2", "seed=3"]
-    assert Path("outputs/latest").resolve() == Path("mine").resolve()
-
-
 def test_a_job_is_a_single_run_without_the_settings_of_the_attempts(train, calls):
     train(*LINE, "select=psnr", "steps=7", "launcher=joblib")
     words = calls(only_folder())[1]["words"]
@@ -324,27 +318,6 @@ def test_without_links_the_best_is_a_copy_and_an_earlier_copy_is_kept(tmp_path, 
     link_best(tmp_path, "seed=1")
     assert json.loads((tmp_path / "best" / "summary.json").read_text()) == {"seed": 1}
     assert (tmp_path / "best-2" / "mine.txt").exists()
-
-
-def test_a_copy_that_was_interrupted_is_not_taken_for_the_best(tmp_path, monkeypatch):
-    def refuse(*_: object) -> None:
-        raise OSError(1, "Operation not permitted")
-
-    def end(*_: object, **__: object) -> None:
-        (tmp_path / "copied").touch()
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(links.Path, "symlink_to", refuse)
-    (tmp_path / "seed=0").mkdir()
-    for name in ("summary.json", "asset.ply"):
-        (tmp_path / "seed=0" / name).touch()
-    with monkeypatch.context() as patch:
-        patch.setattr(shutil, "copystat", end)  # the last thing that a copy does
-        with pytest.raises(KeyboardInterrupt):
-            link_best(tmp_path, "seed=0")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["copied", "seed=0"]
-    link_best(tmp_path, "seed=0")
-    assert (tmp_path / "best" / "asset.ply").exists()
 
 
 @pytest.mark.parametrize("word", ["seed=0,1", "prompts=paper50", "grid=paper"])

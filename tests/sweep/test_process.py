@@ -68,13 +68,6 @@ def test_every_end_of_a_process_is_an_outcome(sweep, prompt, outcome, message, c
     assert end["seconds"] > 0
 
 
-def test_numbers_that_a_killed_run_has_written_are_kept(sweep):
-    folder = sweep("a kill")
-    run_job(folder, 0)
-    row, _ = ended(folder)
-    assert row.summary["num_gaussians"] == 5
-
-
 def test_the_console_of_a_job_goes_to_its_folder(sweep, capfd):
     folder = sweep("a cube")
     run_job(folder, 0)
@@ -92,13 +85,6 @@ def test_a_job_gets_its_folder_the_flags_and_the_threads_of_the_plan(sweep, call
         *("train", "prompt='a cube'", "seed=3", "--config-dir", "/mine"),
         f"hydra.run.dir='{folder}/job_1'",
     ]
-
-
-def test_a_plan_without_threads_does_not_change_the_environment(sweep, calls, monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    folder = sweep("a cube")
-    run_job(folder, 0)
-    assert calls(folder)[0]["threads"] == "7"
 
 
 @pytest.mark.parametrize("is_root", [True, False])
@@ -131,13 +117,6 @@ def test_a_job_without_a_checkpoint_starts_in_an_empty_folder(sweep, calls):
     run_job(folder, 0)
     assert [call["files"] for call in calls(folder)] == [[".lock", "console.txt"]] * 2
     assert (folder / "job_1/.lock").stat().st_ino == lock  # a waiting process must see the same file
-
-
-def test_a_job_with_a_result_does_not_run_again(sweep, calls):
-    folder = sweep("a cube")
-    run_job(folder, 0)
-    run_job(folder, 0)
-    assert len(calls(folder)) == 1
 
 
 def test_no_job_starts_in_a_sweep_that_is_being_stopped(sweep, calls):
@@ -300,7 +279,7 @@ def test_sigterm_of_a_worker_reaches_its_job(sweep):
     folder = sweep("a wait")
     worker = start_worker(folder)
     worker.send_signal(signal.SIGINT)
-    time.sleep(0.5)
+    time.sleep(0.2)
     assert worker.poll() is None
     worker.terminate()
     assert worker.wait(20) == 0
@@ -328,7 +307,7 @@ def test_a_job_ends_with_the_process_that_started_it():
     )
     assert worker.stdout is not None
     pid = int(worker.stdout.readline())
-    time.sleep(1.5)
+    time.sleep(0.2)
     assert Path(f"/proc/{pid}").exists() or not Path("/proc").exists()
     worker.kill()
     worker.communicate()
