@@ -17,7 +17,7 @@ from cadam3d.core.outcome import Outcome
 from cadam3d.core.render import RenderFn
 from cadam3d.core.sh import MAX_DEGREE
 from cadam3d.densifier.base import Densifier
-from cadam3d.optimizer import AdamSettings, GaussianOptimizer
+from cadam3d.optimizer import MOMENTS, AdamSettings, GaussianOptimizer, parts_of
 from cadam3d.rasterizer.base import Rasterizer
 
 __all__ = ["Outcome", "Population", "RefineReport", "RunContext", "StepReport", "TrainState"]
@@ -91,9 +91,9 @@ class TrainState:
         Raises ``PayloadError`` if any entry is not what :meth:`to_payload` writes, and ``UserError`` if the
         checkpoint belongs to another kind of densifier.
         """
-        blank = _blank(payload, optimizer, densifier)
-        _require_like("", payload, blank.to_payload())
-        rows = type(blank.densifier)(**payload["densifier"])
+        blank = densifier.init_state(0, torch.device("cpu"))
+        _require_like("", payload, _template(payload, densifier))
+        rows = type(blank)(**payload["densifier"])
         _require_reachable(payload, rows)
         owner = optimizer.start(Gaussians(**payload["gaussians"]).to(device))
         owner.load_state_dict(payload["optimizer"])
@@ -176,8 +176,8 @@ def start_generators(seed: int) -> dict[str, torch.Generator]:
     }
 
 
-def _blank(payload: Any, optimizer: AdamSettings, densifier: Densifier) -> TrainState:
-    """Return a state without values that is as large as a checkpoint claims to be.
+def _template(payload: Any, densifier: Densifier) -> dict[str, Any]:
+    """Return what a checkpoint holds that is as large as ``payload`` claims to be: the types and the shapes.
 
     Raises ``PayloadError`` if it claims no size, and ``UserError`` if it belongs to another densifier.
     """
@@ -187,30 +187,27 @@ def _blank(payload: Any, optimizer: AdamSettings, densifier: Densifier) -> Train
     _require(coefficients in SH_SIZES, "gaussians.sh", f"one of {SH_SIZES} coefficients")
     shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "opacity_logits": (n,)}
     shapes["sh"] = (n, coefficients, 3)
-    gaussians = {name: torch.empty(shape, device="meta") for name, shape in shapes.items()}
-    blank = densifier.init_state(n, torch.device("meta"))
+    # One number, repeated without memory.
+    gaussians = Gaussians(**{name: torch.zeros(()).expand(shape) for name, shape in shapes.items()})
+    blank = densifier.init_state(n, torch.device("meta")).to_dict()
     _require(type(rows) is dict and all(type(name) is str for name in rows), "densifier", "names and tensors")
-    expected = sorted(blank.to_dict())
     require(
-        expected == sorted(rows),
+        sorted(blank) == sorted(rows),
         "densifier",
         expected=f"the one of the checkpoint (state: {sorted(rows)})",
-        got=expected,
+        got=sorted(blank),
         example="resume without densifier=...",
     )
-    return TrainState(
-        step=0,
-        seconds=0.0,
-        num_initial=0,
-        initial_note=None,
-        skipped=0,
-        dimmed=0,
-        refused=False,
-        seed=0,
-        optimizer=optimizer.start(Gaussians(**gaussians)),
-        densifier=blank,
-        generators=start_generators(0),
-    )
+    return {
+        **dict.fromkeys(("step", "num_initial", "skipped", "dimmed", "seed"), 0),
+        "seconds": 0.0,
+        "initial_note": None,
+        "refused": False,
+        "gaussians": gaussians.tensors(),
+        "optimizer": {"steps": 0, **dict.fromkeys(MOMENTS, parts_of(gaussians))},
+        "densifier": blank,
+        "generators": dict.fromkeys(GENERATORS, torch.Generator().get_state()),
+    }
 
 
 def _entry(entries: Any, name: str) -> Any:
