@@ -15,7 +15,14 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.reading import read_yaml
 from cadam3d.settings.compose import NO_NAME_COMPLAINT, compose, flatten, quote
 from cadam3d.settings.line import key_of
-from cadam3d.settings.options import config_dir, example_word, option_names, option_word, read_option
+from cadam3d.settings.options import (
+    config_dir,
+    default_option,
+    example_word,
+    option_names,
+    option_word,
+    read_option,
+)
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
 # The package of each option of hydra/launcher that Hydra itself lacks.
@@ -179,18 +186,18 @@ def _unknown_key(key: str, command: str, words: Sequence[str]) -> UserError:
         line = f"cadam3d {command} --cfg job"
         return UserError(f"{key}: expected the keys of the present value, got others. Try: {line}")
     value = next((word.partition("=")[2] for word in words if key_of(word) == key), "...")
-    if owners := list(_options_with(key)):
+    if owners := list(_options_with(key))[:3]:
         line = f"{owners[0]} {shlex.quote(f'{key}={value}')}"
         return UserError(f"{key}: a setting of {' and '.join(owners)}, not of the chosen option. Try: {line}")
-    last = key.rpartition(".")[2].lower()
-    same_name = [name for name in known if name.rpartition(".")[2].lower() == last]
-    if near := same_name or did_you_mean(key, list(known)):
-        meant, line = " or ".join(near[:3]), shlex.quote(f"{near[0]}={value}")
-        return UserError(f"{key}: no such setting. Did you mean {meant}? Try: {line}")
-    root = key.partition(".")[0]
-    if others := [other for other in COMMANDS if other != command and root in declared_names(other)]:
+    root, last = key.partition(".")[0], key.rpartition(".")[2].lower()
+    same_name = [name for name in known if name.rpartition(".")[2].lower() == last][:3]
+    others = [other for other in COMMANDS if other != command and root in declared_names(other)]
+    if others and not same_name:
         line = f"cadam3d {others[0]} --help"
         return UserError(f"{key}: no such setting of {command}, but of {' and '.join(others)}. Try: {line}")
+    if near := same_name or did_you_mean(key, list(known))[:1]:
+        meant, line = " or ".join(near), shlex.quote(f"{near[0]}={value}")
+        return UserError(f"{key}: no such setting. Did you mean {meant}? Try: {line}")
     # A sweep has such a page only for a line with jobs.
     page = "train" if command == "sweep" else command
     return UserError(f"{key}: no such setting. Try: cadam3d {page} --cfg job")
@@ -238,7 +245,7 @@ def _known(wrong: str, command: str, words: Sequence[str]) -> dict[str, object]:
 def _several_values(override: str, command: str) -> UserError:
     """Explain that several values need a sweep, or brackets if they are one list."""
     key, _, value = override.partition("=")
-    line = shlex.quote(f"{key}=[{value}]")
-    if command in ("train", "sweep") and not isinstance(_known(key, command, []).get(key), list):
-        line = f"{line_of('sweep', [override])}, or for a list {line}"
-    return UserError(f"{key}: expected one value, got {value!r}. Several values make a sweep. Try: {line}")
+    is_list = isinstance(_known(key, command, []).get(key), list) or isinstance(default_option(key), list)
+    if is_list or command not in ("train", "sweep"):
+        return UserError(f"{key}: a list has brackets. Try: {shlex.quote(f'{key}=[{value}]')}")
+    return UserError(f"{key}: several values make a sweep. Try: {line_of('sweep', [override])}")
