@@ -53,9 +53,9 @@ def write_paper_table(folder: Path) -> str:
 def comparison(folder: Path, baseline: str | None = None) -> str:
     """Return the table of a sweep that compares its arms, as text; "" if nothing is comparable."""
     from cadam3d.report.results import read
-    from cadam3d.report.tables import as_texts, comparison_table
+    from cadam3d.report.tables import shown_comparison, comparison_table
     from cadam3d.sweep.table import aligned
 
     results = read(folder)
-    lines = as_texts(comparison_table(results, baseline), results)
+    lines = shown_comparison(comparison_table(results, baseline), results)
     return aligned([list(lines[0]), *(list(line.values()) for line in lines)]) if lines else ""

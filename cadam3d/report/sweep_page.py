@@ -120,7 +120,7 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None, baseline: str 
         extent=_extent(results),
         warnings=_unknown(chosen, kinds),
         choice=_choice(sweep_folder, plan),
-        comparison=table(tables.as_texts(comparison, results)),
+        comparison=table(tables.shown_comparison(comparison, results), align_decimals=True),
         paper_table=_shown(paper),
         paper_notes=[] if paper is None else paper.notes,
         medians=table(medians, align_decimals=True),

@@ -75,15 +75,18 @@ def _difference(results: Sequence[JobResult], setting: ArmSetting, arm: str) -> 
     return line | {"unpaired": found.unpaired or None, "ended early": found.early or None}
 
 
-def as_texts(lines: Sequence[Line], results: Sequence[JobResult]) -> list[Line]:
-    """Return lines of :func:`comparison_table` with every estimate as text."""
+def shown_comparison(lines: Sequence[Line], results: Sequence[JobResult]) -> list[Line]:
+    """Return the lines of main settings of a :func:`comparison_table`, with every estimate as text."""
     digits = {each.heading: each.digits for each in qualities(results)}
     digits |= {f"{heading} at equal count": count for heading, count in digits.items()}
+    names = {main_setting(results, arm).name for arm in arms_of(results)}
 
     def text(key: str, value: Any) -> Any:
         return value.written(digits.get(key, 1)) if isinstance(value, Estimate) else value
 
-    return [{key: text(key, value) for key, value in line.items()} for line in lines]
+    return [
+        {key: text(key, value) for key, value in line.items()} for line in lines if line["setting"] in names
+    ]
 
 
 def medians_table(results: Sequence[JobResult]) -> list[Line]:

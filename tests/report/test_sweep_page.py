@@ -197,7 +197,7 @@ def test_the_comparison_has_an_estimate_of_every_difference(jobs):
         jobs.add("cadam", *where, n=1000, psnr=15.5 + i, seconds=3.0)
     jobs.add("cadam", "prompt=another", "seed=0", n=1000, psnr=9.0)
     results = read(jobs.folder)
-    [line] = tables.as_texts(tables.comparison_table(results), results)
+    [line] = tables.shown_comparison(tables.comparison_table(results), results)
     assert line == {
         "setting": "cadam",
         "against": "baseline (tau_pos 0.0002)",
