@@ -53,7 +53,7 @@ def write_paper_table(folder: Path) -> str:
 def comparison(folder: Path, baseline: str | None = None) -> str:
     """Return the table of a sweep that compares its arms, as text; "" if nothing is comparable."""
     from cadam3d.report.results import read
-    from cadam3d.report.tables import shown_comparison, comparison_table
+    from cadam3d.report.tables import comparison_table, shown_comparison
     from cadam3d.sweep.table import aligned
 
     results = read(folder)
