@@ -167,9 +167,9 @@ class Browser:
 
     @classmethod
     @contextmanager
-    def start(cls, *, needs_packages: bool = True) -> Iterator["Browser"]:
+    def start(cls) -> Iterator["Browser"]:
         """Start the browser and the server; skip the test where something is absent."""
-        folders = {"pages": PAGES, **({"packages": packages()} if needs_packages else {})}
+        folders = {"pages": PAGES, "packages": packages()}
         with _serve(folders) as origin, headless() as chromium:
             yield cls(chromium, origin, folders)
 
@@ -187,23 +187,6 @@ class Browser:
                 raise RefusedError(result)
             return _settled(opened)
 
-    def picture_of_viewer(self, path: Path, view: View) -> Picture:
-        """Return the picture of our own page ``viewer.html``, opened as a file."""
-        with self.open(path.as_uri(), view.size, view.size) as opened:
-            opened.wait_for_selector("#loading", state="detached", timeout=1000 * PATIENCE_S)
-            camera = {
-                "azimuth": view.azimuth_deg,
-                "elevation": view.elevation_deg,
-                "distance": view.distance,
-                "fov": view.fov_y_deg,
-                "target": [0, 0, 0],
-            }
-            # Without the line of controls, the picture fills the window.
-            opened.evaluate(
-                "(camera) => { document.querySelector('footer').remove(); view.camera = camera; }", camera
-            )
-            return _settled(opened)
-
     @contextmanager
     def open(self, address: str, width: int, height: int) -> Iterator[object]:
         """Open a page in a fresh context, and check at the end that it requested nothing from elsewhere."""
@@ -216,7 +199,7 @@ class Browser:
             yield page
         finally:
             context.close()
-        local = (self.origin + "/", "data:", "blob:", *([address] if address.startswith("file:") else []))
+        local = (self.origin + "/", "data:", "blob:")
         assert not [url for url in requests if not url.startswith(local)]
 
 
