@@ -62,9 +62,9 @@ class LucidAugmentation(Augmentation):
     flip: float  # probability
 
     def __post_init__(self) -> None:
-        require_range("augmentation.scale_noise", self.scale_noise, low=0, high=1, example=0.1118)
-        require_range("augmentation.disparity", self.disparity, low=0, high=1, example=0.2)
-        require_range("augmentation.flip", self.flip, low=0, high=1, example=0.5)
+        require_range("augmentation.scale_noise", self.scale_noise, low=0, high=1)
+        require_range("augmentation.disparity", self.disparity, low=0, high=1)
+        require_range("augmentation.flip", self.flip, low=0, high=1)
 
     def perturb(self, gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
         """Return the same Gaussians with ``scales * max(1 + scale_noise * N(0, 1), 0.001)``."""

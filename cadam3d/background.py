@@ -45,7 +45,7 @@ class RandomBackground(Background):
     shared: bool
 
     def __post_init__(self) -> None:
-        require_range("background.probability", self.probability, low=0, high=1, example=0.5)
+        require_range("background.probability", self.probability, low=0, high=1)
         require_color("background.color", self.color)
         require_choice("background.shared", self.shared, (True, False))
 
@@ -66,8 +66,8 @@ class LucidBackground(Background):
     color: Sequence[float]  # RGB in [0, 1]
 
     def __post_init__(self) -> None:
-        require_range("background.probability", self.probability, low=0, high=1, example=0.66)
-        require_range("background.black", self.black, low=0, high=1, example=0.5)
+        require_range("background.probability", self.probability, low=0, high=1)
+        require_range("background.black", self.black, low=0, high=1)
         require_color("background.color", self.color)
 
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
@@ -85,7 +85,7 @@ class BlackOrWhite(Background):
     white: float  # in [0, 1]
 
     def __post_init__(self) -> None:
-        require_range("background.white", self.white, low=0, high=1, example=0.5)
+        require_range("background.white", self.white, low=0, high=1)
 
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
         """Return black or white for each view."""

@@ -31,7 +31,7 @@ from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.regularizer import Regularizer
 from cadam3d.settings.check import require_declared
 from cadam3d.settings.compose import escaped
-from cadam3d.settings.options import TARGET, option_names, read_option
+from cadam3d.settings.options import TARGET, option_names, read_option, with_example
 from cadam3d.trainer import Trainer
 
 CONFIGURATION = "configuration"  # the place of a node that has no other name
@@ -54,7 +54,7 @@ def build_trainer(
         return given[name] if name in given else component(cfg[name], kind, name)
 
     require_unused(cfg)
-    require_whole("steps", cfg.steps, low=1, high=FAR_STEP, example=600)
+    require_whole("steps", cfg.steps, low=1, high=FAR_STEP)
     refine: Refine = part("refine", Refine)
     require(
         refine.steps == cfg.steps,
@@ -100,8 +100,8 @@ def require_views(cfg: DictConfig) -> None:
     # A camera from elsewhere may use this key differently, or may have no such key.
     size = cfg.camera.get("size")
     size = size if isinstance(size, int) and size > 0 else 1
-    require_memory("camera.size", size, unit=PIXEL, power=2, example=128)
-    require_memory("views", cfg.views, unit=max(CAMERA, PIXEL * float(size) ** 2), example=2)
+    require_memory("camera.size", size, unit=PIXEL, power=2)
+    require_memory("views", cfg.views, unit=max(CAMERA, PIXEL * float(size) ** 2))
 
 
 def component(node: Any, kind: type = object, key: str = CONFIGURATION) -> Any:
@@ -183,7 +183,7 @@ def _construction_error(error: InstantiationException, node: DictConfig, key: st
     named = re.search(r"full_key: (\S+)", str(error))
     where = _typed_place(node, key, named.group(1)) if named else key
     if isinstance(cause, UserError):
-        return _placed(cause, where)
+        return with_example(_placed(cause, where))
     if cause is None:
         return UserError(f"{where}: {str(error).splitlines()[0]}. Try: cadam3d train --cfg job")
     return cause
@@ -207,4 +207,5 @@ def _placed(error: UserError, where: str) -> UserError:
     text = str(error)
     if not (named := re.match(r"([\w.*]+)\.\w+: ", text)) or f"{named.group(1)}.".startswith(f"{where}."):
         return error
-    return UserError(text.replace(f"{named.group(1)}.", f"{where}."))
+    inside, place = f"{named.group(1)}.", f"{where}."
+    return UserError(text.replace(inside, place), key=error.key.replace(inside, place))

@@ -50,8 +50,8 @@ class BrightnessGuard(Exposure):
     rate: float  # in (0, 1)
 
     def __post_init__(self) -> None:
-        require_whole("exposure.begin", self.begin, low=0, example=1000)
-        require_whole("exposure.end", self.end, low=0, example=4500)
+        require_whole("exposure.begin", self.begin, low=0)
+        require_whole("exposure.end", self.end, low=0)
         require(
             self.end > self.begin,
             "exposure.end",
@@ -59,9 +59,9 @@ class BrightnessGuard(Exposure):
             got=self.end,
             example=f"exposure.end={self.begin + 3500}",
         )
-        require_range("exposure.quantile", self.quantile, low=0, high=1, example=0.85)
-        require_range("exposure.threshold", self.threshold, low=0, example=0.9)
-        require_range("exposure.rate", self.rate, above=0, below=1, example=0.8)
+        require_range("exposure.quantile", self.quantile, low=0, high=1)
+        require_range("exposure.threshold", self.threshold, low=0)
+        require_range("exposure.rate", self.rate, above=0, below=1)
 
     @torch.no_grad()
     def dimming(

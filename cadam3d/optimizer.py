@@ -37,12 +37,12 @@ class AdamSettings:
 
     def __post_init__(self) -> None:
         for part in PARTS:
-            require_scheduled(f"optimizer.{part}_lr", getattr(self, f"{part}_lr"), low=0, example=0.005)
-        require_range("optimizer.beta1", self.beta1, low=0, below=1, example=0.9)
-        require_range("optimizer.beta2", self.beta2, low=0, below=1, example=0.999)
-        require_range("optimizer.eps", self.eps, above=0, example=1e-15)
-        unless_none(require_scheduled, "optimizer.clip_norm", self.clip_norm, above=0, example="null")
-        require_range("optimizer.clip_unit", self.clip_unit, above=0, example=1.0)
+            require_scheduled(f"optimizer.{part}_lr", getattr(self, f"{part}_lr"), low=0)
+        require_range("optimizer.beta1", self.beta1, low=0, below=1)
+        require_range("optimizer.beta2", self.beta2, low=0, below=1)
+        require_range("optimizer.eps", self.eps, above=0)
+        unless_none(require_scheduled, "optimizer.clip_norm", self.clip_norm, above=0)
+        require_range("optimizer.clip_unit", self.clip_unit, above=0)
 
     def start(self, gaussians: Gaussians) -> "GaussianOptimizer":
         """Return an optimizer that owns a copy of ``gaussians``, with zero moments."""

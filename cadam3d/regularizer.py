@@ -30,7 +30,7 @@ class Weighted(Regularizer):
     weight: float | Schedule
 
     def __post_init__(self) -> None:
-        require_scheduled("regularizer.*.weight", self.weight, low=0, example=1.0)
+        require_scheduled("regularizer.*.weight", self.weight, low=0)
 
     def __call__(self, gaussians: Gaussians, output: RenderOutput, step: int) -> Float[Tensor, ""]:
         """Return ``weight(step)`` times :meth:`penalty`."""
@@ -73,7 +73,7 @@ class OutsideBall(Weighted):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range("regularizer.*.radius", self.radius, above=0, example=1.0)
+        require_range("regularizer.*.radius", self.radius, above=0)
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
         """Return the mean over Gaussians of ``max(|mean| - radius, 0)^2``, in world units squared."""

@@ -97,8 +97,8 @@ class Trainer:
     callbacks: Sequence[Callback]
 
     def __post_init__(self) -> None:
-        require_range("steps", self.steps, low=1, example=600)
-        require_range("views", self.views, low=1, example=2)
+        require_range("steps", self.steps, low=1)
+        require_range("views", self.views, low=1)
         self.camera.check_views(self.views)
 
     def step(self, state: TrainState, embedding: PromptEmbedding) -> tuple[StepReport, RefineReport | None]:

@@ -99,5 +99,5 @@ def test_later_draws_do_not_depend_on_the_number_of_gaussians_or_on_earlier_outc
 @pytest.mark.parametrize("key", ["scale_noise", "disparity", "flip"])
 @pytest.mark.parametrize("value", [-0.1, 1.1, float("nan")])
 def test_an_impossible_value_is_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"augmentation\.{key}: expected .* Try: augmentation\.{key}="):
+    with pytest.raises(UserError, match=rf"augmentation\.{key}: expected "):
         LucidAugmentation(**{"scale_noise": 0.1, "disparity": 0.2, "flip": 0.5, key: value})

@@ -104,5 +104,5 @@ def test_an_empty_view_is_dark():
     ],
 )
 def test_an_impossible_value_is_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"^exposure\.{key}: expected .* Try: exposure\.{key}="):
+    with pytest.raises(UserError, match=rf"^exposure\.{key}: expected "):
         guard(**{key: value})

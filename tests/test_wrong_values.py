@@ -300,17 +300,15 @@ def test_the_jobs_of_a_sweep_are_counted_before_they_are_made():
 )
 def test_the_setting_that_asks_for_too_much_memory_is_named(size, views, blamed):
     cfg = OmegaConf.create({"camera": {"size": size}, "views": views})
-    with pytest.raises(UserError, match=rf"^{blamed}: .* Try: {blamed}=[1-9]"):
+    with pytest.raises(UserError, match=rf"^{blamed}: "):
         require_views(cfg)
 
 
 def test_a_size_is_refused_only_if_it_cannot_work():
-    require_memory("camera.size", 4096, unit=20, power=2, example=128)
+    require_memory("camera.size", 4096, unit=20, power=2)
     for value in (10**7, 10**30):
-        with pytest.raises(
-            UserError, match=r"^camera\.size: expected at most \d+, .* Try: camera\.size=128$"
-        ):
-            require_memory("camera.size", value, unit=20, power=2, example=128)
+        with pytest.raises(UserError, match=r"^camera\.size: expected at most \d+, "):
+            require_memory("camera.size", value, unit=20, power=2)
 
 
 @pytest.mark.parametrize("error", [MemoryError(), torch.OutOfMemoryError("out of memory"), UserError("a: b")])

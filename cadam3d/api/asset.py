@@ -251,7 +251,7 @@ class Asset:
 
         Outside of a notebook, write a page into a new temporary folder, print its path, and return it.
         """
-        require_whole("height", height, low=1, example=480)
+        require_whole("height", height, low=1)
         title = self.title or UNTITLED
         page = viewer_page(pack(self.gaussians), title=title)
         if is_notebook():

@@ -88,7 +88,7 @@ class Trainer:
         The prior is loaded and the rasterizer compiled, if they need that.
         """
         seed = self.seed if seed is None else seed
-        require_whole("seed", seed, low=0, example=3)
+        require_whole("seed", seed, low=0)
         with logging_messages(), usual_modes(), deterministic(self.device):
             backend = self.parts.rasterizer.prepare(self.device)
             state = self.parts.start(self.prompt, self.initializer, seed, self.device)
@@ -175,7 +175,7 @@ def compose(  # noqa: PLR0913  (one argument per component)
     with as_guest():
         cfg, _ = prepare("train", overrides)
         device = resolve_device(cfg.device)
-        require_whole("seed", cfg.seed, low=0, example=3)
+        require_whole("seed", cfg.seed, low=0)
         trainer = build_trainer(cfg, device, given)
         if initializer is None:
             initializer = component(cfg.initializer, Initializer, "initializer")

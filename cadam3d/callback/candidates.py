@@ -43,12 +43,10 @@ class Candidates(PictureSettings, Callback):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_whole("callback.candidates.every", self.every, low=1, example=100)
-        self.require_angles("azimuths_deg", self.azimuths_deg, limit=360, example=30)
-        require_range("callback.candidates.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
-        require_whole(
-            "callback.candidates.bins_per_decade", self.bins_per_decade, low=1, high=1000, example=10
-        )
+        require_whole("callback.candidates.every", self.every, low=1)
+        self.require_angles("azimuths_deg", self.azimuths_deg, limit=360)
+        require_range("callback.candidates.elevation_deg", self.elevation_deg, low=-90, high=90)
+        require_whole("callback.candidates.bins_per_decade", self.bins_per_decade, low=1, high=1000)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Delete lines and pictures that a killed run wrote after its last checkpoint."""

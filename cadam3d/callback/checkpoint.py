@@ -17,8 +17,8 @@ class Checkpoint(Callback):
     keep: int  # files
 
     def __post_init__(self) -> None:
-        require_whole("callback.checkpoint.every", self.every, low=1, example=100)
-        require_whole("callback.checkpoint.keep", self.keep, low=1, example=2)
+        require_whole("callback.checkpoint.every", self.every, low=1)
+        require_whole("callback.checkpoint.keep", self.keep, low=1)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Delete checkpoints of later steps, because this run will write its own."""

@@ -47,8 +47,8 @@ class Live(Callback):
     _history: RowHistory = field(default_factory=RowHistory, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        require_range("callback.live.seconds", self.seconds, low=0.1, example=1)
-        require_range("callback.live.share", self.share, above=0, high=1, example=0.05)
+        require_range("callback.live.seconds", self.seconds, low=0.1)
+        require_range("callback.live.share", self.share, above=0, high=1)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Create ``live/`` and write the first numbers, so that a page finds them."""

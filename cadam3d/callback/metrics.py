@@ -16,7 +16,7 @@ class Metrics(Callback):
     every: int  # steps
 
     def __post_init__(self) -> None:
-        require_whole("callback.metrics.every", self.every, low=1, example=10)
+        require_whole("callback.metrics.every", self.every, low=1)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Delete lines of steps that a killed run did after its last checkpoint."""

@@ -28,9 +28,9 @@ class Previews(PictureSettings, Callback):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.every is not None:
-            require_whole("callback.previews.every", self.every, low=1, example=100)
-        self.require_views(self.views, example=4, bytes_each=PIXEL * float(self.size) ** 2)
-        require_range("callback.previews.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
+            require_whole("callback.previews.every", self.every, low=1)
+        self.require_views(self.views, bytes_each=PIXEL * float(self.size) ** 2)
+        require_range("callback.previews.elevation_deg", self.elevation_deg, low=-90, high=90)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Delete pictures that a killed run drew after its last checkpoint."""

@@ -46,8 +46,8 @@ class Progress(Callback):
     _pending: str = field(default="", init=False, repr=False)
 
     def __post_init__(self) -> None:
-        require_range("callback.progress.refresh_seconds", self.refresh_seconds, low=0, example=0.5)
-        require_range("callback.progress.line_seconds", self.line_seconds, low=0, example=10)
+        require_range("callback.progress.refresh_seconds", self.refresh_seconds, low=0)
+        require_range("callback.progress.line_seconds", self.line_seconds, low=0)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Open the bar at the current step, if standard error can show one."""

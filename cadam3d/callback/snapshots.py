@@ -28,8 +28,8 @@ class Snapshots(Callback):
     _history: RowHistory = field(default_factory=RowHistory, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        require_whole("callback.snapshots.every", self.every, low=1, example=50)
-        require_whole("callback.snapshots.largest", self.largest, low=0, example=20000)
+        require_whole("callback.snapshots.every", self.every, low=1)
+        require_whole("callback.snapshots.largest", self.largest, low=0)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Record the start. Delete what a killed run recorded after its last checkpoint."""

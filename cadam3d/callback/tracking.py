@@ -42,7 +42,7 @@ class Tracking(Callback):
                 f"callback={self.package}: expected the package {self.package}, got none. "
                 f"Try: pip install 'cadam3d[{self.package}]'"
             )
-        require_whole(f"callback.{self.package}.every", self.every, low=1, example=10)
+        require_whole(f"callback.{self.package}.every", self.every, low=1)
 
     @abstractmethod
     def open(self, context: RunContext, step: int) -> None:

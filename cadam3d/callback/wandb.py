@@ -53,7 +53,7 @@ class Wandb(Tracking):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_choice("callback.wandb.mode", self.mode, MODES)
-        require_range("callback.wandb.timeout", self.timeout, low=1, example=30)
+        require_range("callback.wandb.timeout", self.timeout, low=1)
 
     def open(self, context: RunContext, step: int) -> None:
         """Start a run of wandb, or continue that of the folder: offline, unless a server accepts it."""

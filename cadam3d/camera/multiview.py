@@ -42,10 +42,8 @@ class Multiview(CameraSampler):
     def __post_init__(self) -> None:
         require_size(self.size)
         require_elevations(self.elevation_law, self.elevation_deg)
-        require_interval(
-            "camera.relative_distance", self.relative_distance, low=0, high=100, example="[0.8,1]"
-        )
-        require_interval("camera.fov_y_deg", self.fov_y_deg, low=1, high=170, example="[15,60]")
+        require_interval("camera.relative_distance", self.relative_distance, low=0, high=100)
+        require_interval("camera.fov_y_deg", self.fov_y_deg, low=1, high=170)
         least = OUTSIDE * math.tan(math.radians(self.fov_y_deg[1]) / 2)
         require(
             self.relative_distance[0] >= least,

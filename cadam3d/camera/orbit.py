@@ -36,7 +36,7 @@ class Orbit(CameraSampler):
 
     def __post_init__(self) -> None:
         require_size(self.size)
-        require_interval("camera.azimuth_deg", self.azimuth_deg, low=-360, high=360, example="[-180,180]")
+        require_interval("camera.azimuth_deg", self.azimuth_deg, low=-360, high=360)
         require_elevations(self.elevation_law, self.elevation_deg)
         require_lens(self.distance, self.fov_y_deg)
 

@@ -81,17 +81,17 @@ class Progressive(CameraSampler):
             _require_widening(f"camera.{name}", getattr(self, name))
         for side in ("start", "end"):
             turn, rise = getattr(self.azimuth_deg, side), getattr(self.elevation_deg, side)
-            require_interval(f"camera.azimuth_deg.{side}", turn, low=-360, high=360, example="[-180,180]")
-            require_interval(f"camera.elevation_deg.{side}", rise, low=-90, high=90, example="[-15,45]")
+            require_interval(f"camera.azimuth_deg.{side}", turn, low=-360, high=360)
+            require_interval(f"camera.elevation_deg.{side}", rise, low=-90, high=90)
             require_lens(getattr(self.distance, side), getattr(self.fov_y_deg, side), f".{side}")
         for name in ("azimuth_deg", "elevation_deg", "distance", "fov_y_deg"):
             _require_motion(f"camera.{name}", getattr(self, name))
-        require_whole("camera.begin", self.begin, low=0, example=500)
-        require_whole("camera.every", self.every, low=1, example=500)
-        require_range("camera.gamma", self.gamma, above=0, example=1.0)
-        require_range("camera.position_jitter", self.position_jitter, low=0, high=0.5, example=0.05)
-        require_range("camera.target_jitter", self.target_jitter, low=0, high=1, example=0.1)
-        require_range("camera.up_jitter", self.up_jitter, low=0, high=1, example=0.01)
+        require_whole("camera.begin", self.begin, low=0)
+        require_whole("camera.every", self.every, low=1)
+        require_range("camera.gamma", self.gamma, above=0)
+        require_range("camera.position_jitter", self.position_jitter, low=0, high=0.5)
+        require_range("camera.target_jitter", self.target_jitter, low=0, high=1)
+        require_range("camera.up_jitter", self.up_jitter, low=0, high=1)
 
     def widenings(self, step: int) -> int:
         """Return how often the ranges have widened at ``step``, where 0 is the first step."""
@@ -142,7 +142,7 @@ def _require_widening(key: str, value: object) -> None:
         got=value.factor,
         example=f"'{key}.factor=[0.75,1.1]'",
     )
-    require_range(f"{key}.about", value.about, example=0.0)
+    require_range(f"{key}.about", value.about)
 
 
 def _require_motion(key: str, value: Widening) -> None:

@@ -48,13 +48,13 @@ def image_size(size: int | Schedule, step: int) -> int:
 def require_size(size: int | Schedule) -> None:
     """Raise ``UserError`` unless ``size`` is a schedule or a whole number of pixels that fits into memory."""
     if isinstance(size, Schedule):
-        require_scheduled("camera.size", size, low=1, example=128)
+        require_scheduled("camera.size", size, low=1)
     else:
-        require_whole("camera.size", size, low=1, example=128)
-        require_memory("camera.size", size, unit=PIXEL, power=2, example=128)
+        require_whole("camera.size", size, low=1)
+        require_memory("camera.size", size, unit=PIXEL, power=2)
 
 
-def require_interval(key: str, interval: object, *, low: float, high: float, example: str) -> None:
+def require_interval(key: str, interval: object, *, low: float, high: float) -> None:
     """Raise ``UserError`` unless ``interval`` is two ascending numbers in ``[low, high]``."""
     is_interval = (
         are_numbers(interval, low=low, high=high) and len(interval) == 2 and interval[0] <= interval[1]
@@ -64,14 +64,13 @@ def require_interval(key: str, interval: object, *, low: float, high: float, exa
         key,
         expected=f"[low, high] in ascending order between {low:g} and {high:g}",
         got=interval,
-        example=f"'{key}={example}'",
     )
 
 
 def require_elevations(law: object, interval: object) -> None:
     """Raise ``UserError`` unless ``law`` is known and ``interval`` is two ascending elevations in degrees."""
     require_choice("camera.elevation_law", law, ELEVATION_LAWS)
-    require_interval("camera.elevation_deg", interval, low=-90, high=90, example="[-10,60]")
+    require_interval("camera.elevation_deg", interval, low=-90, high=90)
 
 
 def require_lens(distance: object, fov_y_deg: object, suffix: str = "") -> None:
@@ -79,5 +78,5 @@ def require_lens(distance: object, fov_y_deg: object, suffix: str = "") -> None:
 
     ``suffix`` is appended to the names of the keys in the message, such as ``.start``.
     """
-    require_interval(f"camera.distance{suffix}", distance, low=1, high=1000, example="[3.0,3.6]")
-    require_interval(f"camera.fov_y_deg{suffix}", fov_y_deg, low=1, high=170, example="[40,45]")
+    require_interval(f"camera.distance{suffix}", distance, low=1, high=1000)
+    require_interval(f"camera.fov_y_deg{suffix}", fov_y_deg, low=1, high=170)

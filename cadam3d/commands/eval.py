@@ -140,7 +140,7 @@ def _explained(score: Score) -> str:
 def start_of(components_of: Callable[[tuple[str, ...]], DictConfig], device: torch.device) -> Gaussians:
     """Return the Gaussians that a run has started from, built again from its settings."""
     source = components_of(("initializer",))
-    require_whole("seed", source.seed, low=0, example=3)
+    require_whole("seed", source.seed, low=0)
     initializer: Initializer = component(source.initializer, Initializer, "initializer")
     return rebuild_start(source.prompt, initializer, source.seed, device)
 

@@ -60,7 +60,6 @@ def _compare(cfg: DictConfig) -> tuple[list[Output], list[Subject]]:
             "labels",
             expected=f"one text of 1 to {LONGEST_LABEL} characters for each of the {len(folders)} runs",
             got=labels,
-            example="labels=null",
         )
     assets = [open_run(folder, cfg.device) for folder in folders]
     subjects = [

@@ -97,10 +97,10 @@ def _write(cfg: DictConfig) -> None:
 
 def _settings(cfg: DictConfig) -> ClipSettings:
     """Return how clips are rendered, after all other settings of a page have been checked."""
-    require_whole("seed", cfg.seed, low=0, example=0)
-    require_range("catch_share", cfg.catch_share, low=0, high=1, example=0.1)
+    require_whole("seed", cfg.seed, low=0)
+    require_range("catch_share", cfg.catch_share, low=0, high=1)
     if cfg.pairs is not None:
-        require_whole("pairs", cfg.pairs, low=1, example=30)
+        require_whole("pairs", cfg.pairs, low=1)
     return ClipSettings(
         size=cfg.size,
         frames=cfg.frames,
@@ -215,7 +215,7 @@ def _evaluate(cfg: DictConfig) -> None:
     from cadam3d.study.analysis import analyse
     from cadam3d.study.summary import bullets, markdown
 
-    require_range("least_caught", cfg.least_caught, low=0, high=1, example=0.8)
+    require_range("least_caught", cfg.least_caught, low=0, high=1)
     paths = find_files(_texts(cfg.answers))
     files, left = read_files(paths)
     if not files:

@@ -47,7 +47,7 @@ def optimise(
     folder changes.
     """
     device = resolve_device(cfg.device)
-    require_whole("seed", cfg.seed, low=0, example=3)
+    require_whole("seed", cfg.seed, low=0)
     resume = Path(str(cfg.resume)) if cfg.resume else None
     with (
         occupied(call.folder, is_chosen=call.has_chosen_folder, resume=resume) as folder,

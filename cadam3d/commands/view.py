@@ -27,7 +27,7 @@ from cadam3d.sweep.folder import is_sweep
 
 def run(cfg: DictConfig, _call: Call) -> None:
     """Serve the page of ``run=`` or ``ply=`` until Ctrl-C. For a sweep, open its report instead."""
-    require_whole("port", cfg.port, low=0, high=65535, example=0)
+    require_whole("port", cfg.port, low=0, high=65535)
     require_one(cfg)
     if cfg.run is not None and is_sweep(folder := typed_path(str(cfg.run))):
         page = folder / REPORT if has_file(folder, REPORT) else report.write_sweep(folder)

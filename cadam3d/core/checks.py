@@ -7,16 +7,22 @@ from typing import TypeGuard
 
 from cadam3d.core.errors import UserError
 
+LONGEST_SHOWN = 100  # characters of a wrong value in a message
 
-def fail(key: str, *, expected: str, got: object, example: str) -> UserError:
+
+def fail(key: str, *, expected: str, got: object, example: str = "") -> UserError:
     """Build the error for one configuration key; the caller raises it.
 
-    ``example`` is a whole argument to paste, such as ``"densifier.tau_Q=0.9"``.
+    ``example`` is a whole argument to paste, such as ``"densifier.tau_reset=null"``. Without one, the command
+    line suggests the value of the YAML files.
     """
-    return UserError(f"{key}: expected {expected}, got {got!r}. Try: {example}")
+    shown = repr(got)
+    shown = shown if len(shown) <= LONGEST_SHOWN else f"{shown[:LONGEST_SHOWN]}... ({len(shown)} characters)"
+    message = f"{key}: expected {expected}, got {shown}."
+    return UserError(f"{message} Try: {example}") if example else UserError(message, key=key)
 
 
-def require(claim: bool, key: str, *, expected: str, got: object, example: str) -> None:
+def require(claim: bool, key: str, *, expected: str, got: object, example: str = "") -> None:
     """Raise :class:`UserError` unless ``claim`` holds."""
     if not claim:
         raise fail(key, expected=expected, got=got, example=example)
@@ -30,11 +36,10 @@ def require_range(
     high: float = math.inf,
     below: float = math.inf,
     above: float = -math.inf,
-    example: object,
 ) -> None:
     """Raise unless ``value`` is a finite number in ``[low, high]``, ``< below`` and ``> above``.
 
-    Example: ``require_range("densifier.tau_Q", tau_Q, low=0, below=1, example=0.9)``.
+    Example: ``require_range("densifier.tau_Q", tau_Q, low=0, below=1)``.
     """
     bounds = [
         f"{sign} {bound:g}"
@@ -44,20 +49,18 @@ def require_range(
     number = value if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
     if not (low <= number <= high and above < number < below):
         expected = "a number " + " and ".join(bounds) if bounds else "a finite number"
-        raise fail(key, expected=expected, got=value, example=f"{key}={example}")
+        raise fail(key, expected=expected, got=value)
 
 
-def require_whole(
-    key: str, value: object, *, low: float = -math.inf, high: float = math.inf, example: object
-) -> None:
+def require_whole(key: str, value: object, *, low: float = -math.inf, high: float = math.inf) -> None:
     """Raise unless ``value`` is an ``int`` in ``[low, high]``; 2.0 and ``True`` are refused.
 
-    Example: ``require_whole("refine.interval", interval, low=1, example=50)``.
+    Example: ``require_whole("refine.interval", interval, low=1)``.
     """
     if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
         bounds = [f"{sign} {bound}" for sign, bound in ((">=", low), ("<=", high)) if math.isfinite(bound)]
         expected = " ".join(["a whole number", " and ".join(bounds)]).rstrip()
-        raise fail(key, expected=expected, got=value, example=f"{key}={example}")
+        raise fail(key, expected=expected, got=value)
 
 
 def unless_none(check: Callable[..., None], key: str, value: object, **bounds: object) -> None:
@@ -93,8 +96,7 @@ def _written(choice: object) -> str:
 def require_color(key: str, value: object) -> None:
     """Raise :class:`UserError` unless ``value`` is an RGB colour: three numbers in [0, 1]."""
     is_color = are_numbers(value, low=0, high=1) and len(value) == 3
-    example = f"'{key}=[0.5,0.5,0.5]'"
-    require(is_color, key, expected="three numbers in [0, 1]", got=value, example=example)
+    require(is_color, key, expected="three numbers in [0, 1]", got=value)
 
 
 def are_numbers(value: object, *, low: float, high: float) -> TypeGuard[Sequence[float]]:

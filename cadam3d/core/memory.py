@@ -22,7 +22,7 @@ def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, RuntimeError) and any(text in str(error) for text in CPU_FAILURES)
 
 
-def require_memory(key: str, value: int, *, unit: float, power: int = 1, example: object) -> None:
+def require_memory(key: str, value: int, *, unit: float, power: int = 1) -> None:
     """Raise ``UserError`` if ``unit * value**power`` bytes are more than this machine has.
 
     ``unit`` is a lower bound of what the value needs. So a size that is accepted may still be too large, but
@@ -34,7 +34,7 @@ def require_memory(key: str, value: int, *, unit: float, power: int = 1, example
         return
     largest = int((total / unit) ** (1 / power))
     expected = f"at most {largest}, since this machine has {total / GIB:.0f} GiB of memory"
-    raise fail(key, expected=expected, got=value, example=f"{key}={min(int(str(example)), largest)}")
+    raise fail(key, expected=expected, got=value)
 
 
 def _total_bytes(*, with_gpu: bool) -> float:

@@ -32,10 +32,10 @@ class ViewSettings:
     size: int  # >= 1, pixels
 
     def __post_init__(self) -> None:
-        require_range(f"{self.node}.distance", self.distance, above=0, example=3.0)
-        require_range(f"{self.node}.fov_y_deg", self.fov_y_deg, above=0, below=180, example=40)
-        require_whole(f"{self.node}.size", self.size, low=1, example=256)
-        require_memory(f"{self.node}.size", self.size, unit=PIXEL, power=2, example=256)
+        require_range(f"{self.node}.distance", self.distance, above=0)
+        require_range(f"{self.node}.fov_y_deg", self.fov_y_deg, above=0, below=180)
+        require_whole(f"{self.node}.size", self.size, low=1)
+        require_memory(f"{self.node}.size", self.size, unit=PIXEL, power=2)
 
     def ring(self, views: int, elevation_deg: float) -> Cameras:
         """Return ``views`` cameras evenly spaced over one full turn, starting at the front."""
@@ -54,15 +54,15 @@ class ViewSettings:
             azimuths_deg, elevations_deg, full * self.distance, full * self.fov_y_deg, self.size, self.size
         )
 
-    def require_views(self, views: int, *, example: int, bytes_each: float = 0) -> None:
+    def require_views(self, views: int, *, bytes_each: float = 0) -> None:
         """Raise ``UserError`` unless ``views`` is at least 1 and that many cameras fit into memory.
 
         ``bytes_each`` is the memory that every view needs until all are done, in addition to its camera.
         """
-        require_whole(f"{self.node}.views", views, low=1, high=MOST_VIEWS, example=example)
-        require_memory(f"{self.node}.views", views, unit=CAMERA + bytes_each, example=example)
+        require_whole(f"{self.node}.views", views, low=1, high=MOST_VIEWS)
+        require_memory(f"{self.node}.views", views, unit=CAMERA + bytes_each)
 
-    def require_angles(self, name: str, angles_deg: object, *, limit: int, example: int) -> None:
+    def require_angles(self, name: str, angles_deg: object, *, limit: int) -> None:
         """Raise ``UserError`` unless setting ``name`` is a list of angles in [-limit, limit] degrees."""
         key = f"{self.node}.{name}"
         require(
@@ -70,7 +70,6 @@ class ViewSettings:
             key,
             expected=f"at least one angle, each in [-{limit}, {limit}]",
             got=angles_deg,
-            example=f"'{key}=[{example}]'",
         )
 
 

@@ -31,7 +31,7 @@ class Constant(Schedule):
     value: float
 
     def __post_init__(self) -> None:
-        require_range("schedule.value", self.value, example=0.001)
+        require_range("schedule.value", self.value)
 
     def __call__(self, step: int) -> float:
         """Return the value, whatever the step."""
@@ -48,10 +48,10 @@ class _Ramp(Schedule):
     begin: int = 0
 
     def __post_init__(self) -> None:
-        require_whole("schedule.steps", self.steps, low=1, example=600)
-        require_whole("schedule.begin", self.begin, example=0)
-        require_range("schedule.start", self.start, example=1e-3)
-        require_range("schedule.end", self.end, example=1e-5)
+        require_whole("schedule.steps", self.steps, low=1)
+        require_whole("schedule.begin", self.begin)
+        require_range("schedule.start", self.start)
+        require_range("schedule.end", self.end)
 
     def _progress(self, step: int) -> float:
         """Return the share of the way that is done at ``step``, in [0, 1]."""
@@ -73,8 +73,8 @@ class LogLinear(_Ramp):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range("schedule.start", self.start, above=0, example=1e-3)
-        require_range("schedule.end", self.end, above=0, example=1e-5)
+        require_range("schedule.start", self.start, above=0)
+        require_range("schedule.end", self.end, above=0)
 
     def __call__(self, step: int) -> float:
         """Return the value at ``step``."""
@@ -118,7 +118,7 @@ def settled_at(value: float | Schedule) -> int:
     return bisect_left(range(FAR_STEP), True, key=lambda step: schedule(step) == final)
 
 
-def require_scheduled(key: str, value: object, *, example: object, **bounds: float) -> None:
+def require_scheduled(key: str, value: object, **bounds: float) -> None:
     """Raise unless ``value`` is a number in range, or a schedule whose values are in range.
 
     A schedule is checked at its first and last step and at its milestones, which are the extremes of ours.
@@ -127,7 +127,7 @@ def require_scheduled(key: str, value: object, *, example: object, **bounds: flo
     ``above``.
     """
     is_scheduled = isinstance(value, int | float | Schedule)
-    require(is_scheduled, key, expected="a number or a schedule", got=value, example=f"{key}={example}")
+    require(is_scheduled, key, expected="a number or a schedule", got=value)
     for step in (0, *getattr(value, "milestones", ()), FAR_STEP):
         number = value(step) if isinstance(value, Schedule) else value
-        require_range(key, number, example=example, **bounds)
+        require_range(key, number, **bounds)

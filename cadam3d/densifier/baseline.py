@@ -53,10 +53,10 @@ class Baseline(Densifier[BaselineState]):
     screen_px: float | None  # > 0, pixels
 
     def __post_init__(self) -> None:
-        require_scheduled("densifier.tau_pos", self.tau_pos, above=0, example=2e-4)
+        require_scheduled("densifier.tau_pos", self.tau_pos, above=0)
         require_choice("densifier.views", self.views, VIEWS)
-        require_range("densifier.grad_multiplier", self.grad_multiplier, above=0, example=1.0)
-        unless_none(require_range, "densifier.screen_px", self.screen_px, above=0, example=20)
+        require_range("densifier.grad_multiplier", self.grad_multiplier, above=0)
+        unless_none(require_range, "densifier.screen_px", self.screen_px, above=0)
 
     def init_state(self, n: int, device: torch.device) -> BaselineState:
         """Return sums and sizes of zero."""

@@ -57,13 +57,13 @@ class CAdam(CAdamCharts[CAdamState]):
     reset_min_age: int  # updates
 
     def __post_init__(self) -> None:
-        unless_none(require_scheduled, "densifier.tau_Q", self.tau_Q, low=0, below=1, example=0.9)
-        unless_none(require_range, "densifier.tau_SNR", self.tau_SNR, low=0, example=0.1)
-        require_range("densifier.beta1", self.beta1, low=0, below=1, example=0.9)
-        require_range("densifier.beta2", self.beta2, low=0, below=1, example=0.999)
-        require_range("densifier.eps", self.eps, above=0, example=1e-15)
-        require_whole("densifier.min_age", self.min_age, low=0, example=20)
-        require_whole("densifier.reset_min_age", self.reset_min_age, low=0, example=50)
+        unless_none(require_scheduled, "densifier.tau_Q", self.tau_Q, low=0, below=1)
+        unless_none(require_range, "densifier.tau_SNR", self.tau_SNR, low=0)
+        require_range("densifier.beta1", self.beta1, low=0, below=1)
+        require_range("densifier.beta2", self.beta2, low=0, below=1)
+        require_range("densifier.eps", self.eps, above=0)
+        require_whole("densifier.min_age", self.min_age, low=0)
+        require_whole("densifier.reset_min_age", self.reset_min_age, low=0)
         require_choice("densifier.reset", self.reset, RESET if self.least_reliable is not None else RESET[:2])
 
     def init_state(self, n: int, device: torch.device) -> CAdamState:

@@ -55,7 +55,7 @@ class CAdamOpen(CAdam):
         super().__post_init__()
         for name, choices in CHOICES.items():
             require_choice(f"densifier.{name}", getattr(self, name), choices)
-        unless_none(require_range, "densifier.tau_m", self.tau_m, low=0, example=1e-4)
+        unless_none(require_range, "densifier.tau_m", self.tau_m, low=0)
         require(
             any(gate is not None for gate in (self.tau_Q, self.tau_SNR, self.tau_m, self.alpha)),
             "densifier.tau_m",
@@ -63,7 +63,7 @@ class CAdamOpen(CAdam):
             got=self.tau_m,
             example="densifier.tau_m=0.001",
         )
-        unless_none(require_range, "densifier.tau_reset", self.tau_reset, low=0, example=0.1)
+        unless_none(require_range, "densifier.tau_reset", self.tau_reset, low=0)
         require(
             self.tau_reset is None or self.reset == "unreliable",
             "densifier.tau_reset",
@@ -75,7 +75,7 @@ class CAdamOpen(CAdam):
             self._check_alpha(self.alpha)
 
     def _check_alpha(self, alpha: float) -> None:
-        require_range("densifier.alpha", alpha, above=0, below=1, example=0.05)
+        require_range("densifier.alpha", alpha, above=0, below=1)
         require(
             self.tau_SNR is None,
             "densifier.tau_SNR",

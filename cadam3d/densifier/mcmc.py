@@ -41,9 +41,9 @@ class MCMC(GradientFree):
     noise_lr: float  # >= 0, 1 / world units
 
     def __post_init__(self) -> None:
-        require_whole("densifier.cap", self.cap, low=1, example=20_000)
-        require_range("densifier.growth", self.growth, low=0, high=1, example=0.05)
-        require_range("densifier.noise_lr", self.noise_lr, low=0, example=8000)
+        require_whole("densifier.cap", self.cap, low=1)
+        require_range("densifier.growth", self.growth, low=0, high=1)
+        require_range("densifier.noise_lr", self.noise_lr, low=0)
 
     def select(self, state: RowCount, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
         """Return the empty mask: :meth:`plan` grows in its own way, without clones and splits."""

@@ -22,7 +22,7 @@ class RandomGrowth(GradientFree):
     share: float | Schedule  # in [0, 1), tau_Q = 1 - share
 
     def __post_init__(self) -> None:
-        require_scheduled("densifier.share", self.share, low=0, below=1, example=0.1)
+        require_scheduled("densifier.share", self.share, low=0, below=1)
 
     def select(self, state: RowCount, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
         """Return a random mask of as many Gaussians as exceed the quantile ``1 - share`` (paper eq. 9)."""

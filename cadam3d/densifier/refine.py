@@ -61,30 +61,30 @@ class Refine:
     max_gaussians: int | None
 
     def __post_init__(self) -> None:
-        require_whole("refine.steps", self.steps, low=1, high=FAR_STEP, example="'${steps}'")
-        unless_none(require_whole, "refine.made_for", self.made_for, low=1, high=FAR_STEP, example="null")
-        require_whole("refine.start", self.start, low=0, example=100)
-        require_whole("refine.end", self.end, low=0, example=450)
-        require_whole("refine.interval", self.interval, low=1, example=50)
-        require_range("refine.tau_scale", self.tau_scale, above=0, example=0.02)
-        require_whole("refine.split_children", self.split_children, low=2, high=16, example=2)
-        require_range("refine.split_shrink", self.split_shrink, low=1, example=1.6)
-        require_range("refine.min_opacity", self.min_opacity, low=0, below=1, example=0.005)
-        unless_none(require_range, "refine.max_scale", self.max_scale, above=0, example=0.35)
-        unless_none(require_range, "refine.last_max_scale", self.last_max_scale, above=0, example=0.1)
-        require_whole("refine.prune_from", self.prune_from, low=0, example=300)
-        unless_none(require_whole, "refine.max_gaussians", self.max_gaussians, low=1, example=500_000)
+        require_whole("refine.steps", self.steps, low=1, high=FAR_STEP)
+        unless_none(require_whole, "refine.made_for", self.made_for, low=1, high=FAR_STEP)
+        require_whole("refine.start", self.start, low=0)
+        require_whole("refine.end", self.end, low=0)
+        require_whole("refine.interval", self.interval, low=1)
+        require_range("refine.tau_scale", self.tau_scale, above=0)
+        require_whole("refine.split_children", self.split_children, low=2, high=16)
+        require_range("refine.split_shrink", self.split_shrink, low=1)
+        require_range("refine.min_opacity", self.min_opacity, low=0, below=1)
+        unless_none(require_range, "refine.max_scale", self.max_scale, above=0)
+        unless_none(require_range, "refine.last_max_scale", self.last_max_scale, above=0)
+        require_whole("refine.prune_from", self.prune_from, low=0)
+        unless_none(require_whole, "refine.max_gaussians", self.max_gaussians, low=1)
         self._check_reset()
 
     def _check_reset(self) -> None:
-        require_whole("refine.reset_from", self.reset_from, low=0, example=300)
-        require_whole("refine.reset_until", self.reset_until, low=0, example=450)
-        require_range("refine.reset_value", self.reset_value, above=0, below=1, example=0.01)
-        require_whole("refine.recovery", self.recovery, low=1, example=96)
-        require_whole("refine.prune_grace", self.prune_grace, low=0, example=100)
+        require_whole("refine.reset_from", self.reset_from, low=0)
+        require_whole("refine.reset_until", self.reset_until, low=0)
+        require_range("refine.reset_value", self.reset_value, above=0, below=1)
+        require_whole("refine.recovery", self.recovery, low=1)
+        require_whole("refine.prune_grace", self.prune_grace, low=0)
         if self.reset_interval is None:
             return
-        require_whole("refine.reset_interval", self.reset_interval, low=1, example=150)
+        require_whole("refine.reset_interval", self.reset_interval, low=1)
         require(
             self.min_opacity < self.reset_value or self.prune_grace > 0,
             "refine.min_opacity",

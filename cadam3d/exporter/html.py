@@ -29,8 +29,8 @@ class HtmlExporter(Exporter):
     background: Sequence[float] | None  # RGB in [0, 1]; None = as light or dark as the reader's other pages
 
     def __post_init__(self) -> None:
-        require_range("exporter.html.azimuth_deg", self.azimuth_deg, low=-360, high=360, example=30)
-        require_range("exporter.html.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
+        require_range("exporter.html.azimuth_deg", self.azimuth_deg, low=-360, high=360)
+        require_range("exporter.html.elevation_deg", self.elevation_deg, low=-90, high=90)
         if self.background is not None:
             require_color("exporter.html.background", self.background)
 

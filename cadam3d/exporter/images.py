@@ -35,8 +35,8 @@ class ImagesExporter(CutoutSettings, PictureExporter):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_views(self.views, example=8)
-        self.require_angles("elevations_deg", self.elevations_deg, limit=90, example=15)
+        self.require_views(self.views)
+        self.require_angles("elevations_deg", self.elevations_deg, limit=90)
         is_list = not isinstance(self.kinds, str) and isinstance(self.kinds, Sequence)
         require(
             is_list

@@ -39,13 +39,11 @@ class MeshExporter(SurfaceSettings, Exporter):
         super().__post_init__()
         require_choice("exporter.mesh.format", self.format, FORMATS)
         require_choice("exporter.mesh.up", self.up, UPS)
-        require_whole(
-            "exporter.mesh.textured_triangles", self.textured_triangles, low=100, high=2**31, example=10000
-        )
+        require_whole("exporter.mesh.textured_triangles", self.textured_triangles, low=100, high=2**31)
         if self.texture is None:
             return
-        require_whole("exporter.mesh.texture", self.texture, low=64, high=8192, example=1024)
-        require_memory("exporter.mesh.texture", self.texture, unit=TEXEL_BYTES, power=2, example=1024)
+        require_whole("exporter.mesh.texture", self.texture, low=64, high=8192)
+        require_memory("exporter.mesh.texture", self.texture, unit=TEXEL_BYTES, power=2)
         if self.format == "ply":
             raise UserError(
                 "exporter.mesh.texture: expected null with format=ply, which has no textures, "

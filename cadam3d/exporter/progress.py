@@ -40,8 +40,8 @@ class ProgressExporter(Exporter):
     def __post_init__(self) -> None:
         require_choice("exporter.progress.codec", self.codec, CODECS)
         high = FORMATS[f".{self.codec}"].most_fps
-        require_whole("exporter.progress.fps", self.fps, low=1, high=high, example=8)
-        require_range("exporter.progress.hold", self.hold, low=0, high=LONGEST_HOLD, example=1)
+        require_whole("exporter.progress.fps", self.fps, low=1, high=high)
+        require_range("exporter.progress.hold", self.hold, low=0, high=LONGEST_HOLD)
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
         """Read the previews one by one and encode them; the Gaussians are not rendered."""

@@ -43,14 +43,14 @@ class TurntableExporter(CutoutSettings, PictureExporter):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_views(self.views, example=60)
-        require_range("exporter.turntable.turns", self.turns, low=-MOST_TURNS, high=MOST_TURNS, example=1)
-        require_range("exporter.turntable.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
+        self.require_views(self.views)
+        require_range("exporter.turntable.turns", self.turns, low=-MOST_TURNS, high=MOST_TURNS)
+        require_range("exporter.turntable.elevation_deg", self.elevation_deg, low=-90, high=90)
         require_choice("exporter.turntable.codec", self.codec, CODECS)
         kind = FORMATS[f".{self.codec}"]
-        require_whole("exporter.turntable.fps", self.fps, low=1, high=kind.most_fps, example=20)
+        require_whole("exporter.turntable.fps", self.fps, low=1, high=kind.most_fps)
         require_choice("exporter.turntable.beside", self.beside, ("depth", "alpha", "normal", "none"))
-        require_whole("exporter.turntable.size", self.size, low=1, high=LARGEST, example=256)
+        require_whole("exporter.turntable.size", self.size, low=1, high=LARGEST)
         if self.is_transparent and kind.transparent_pixels is None:
             expected, example = "webm, because the background is transparent", "exporter.turntable.codec=webm"
             raise fail("exporter.turntable.codec", expected=expected, got=self.codec, example=example)

@@ -32,7 +32,7 @@ class CSD(Distillation):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_scheduled("guidance.empty_share", self.empty_share, low=0, high=1, example=0.0)
+        require_scheduled("guidance.empty_share", self.empty_share, low=0, high=1)
 
     def compare(self, case: Case) -> Comparison:
         """Subtract the noise of the reference prediction from the noise predicted under the prompt."""

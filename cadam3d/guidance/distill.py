@@ -117,11 +117,11 @@ class Distillation(WindowedGuidance):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range("guidance.weight", self.weight, above=0, example=1.0)
+        require_range("guidance.weight", self.weight, above=0)
         require_choice("guidance.weighting", self.weighting, list(WEIGHTINGS))
         require_choice("guidance.reduction", self.reduction, list(DIVISORS))
         if self.clip is not None:
-            require_scheduled("guidance.clip", self.clip, above=0, example="null")
+            require_scheduled("guidance.clip", self.clip, above=0)
 
     @abstractmethod
     def compare(self, case: Case) -> Comparison:
@@ -176,7 +176,7 @@ class GuidedDistillation(Distillation):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range("guidance.scale", self.scale, low=0, example=7.5)
+        require_range("guidance.scale", self.scale, low=0)
 
 
 def surrogate(

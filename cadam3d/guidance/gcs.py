@@ -102,21 +102,17 @@ class GCS(WindowedGuidance):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range("guidance.scale", self.scale, low=0, example=7.5)
-        require_range("guidance.weight", self.weight, above=0, example=0.1)
+        require_range("guidance.scale", self.scale, low=0)
+        require_range("guidance.weight", self.weight, above=0)
         for key, value in (("w_cc", self.w_cc), ("w_gc", self.w_gc), ("w_cp", self.w_cp)):
-            require_range(f"guidance.{key}", value, low=0, example=0.5)
+            require_range(f"guidance.{key}", value, low=0)
         is_any = max(self.w_cc, self.w_gc, self.w_cp) > 0
         require(
-            is_any,
-            "guidance.w_gc",
-            expected="a number > 0, since w_cc and w_cp are 0 as well",
-            got=self.w_gc,
-            example="guidance.w_gc=0.5",
+            is_any, "guidance.w_gc", expected="a number > 0, since w_cc and w_cp are 0 as well", got=self.w_gc
         )
-        require_scheduled("guidance.delta", self.delta, above=GAP, high=0.5, example=0.08)
+        require_scheduled("guidance.delta", self.delta, above=GAP, high=0.5)
         require_choice("guidance.fixed_noise", self.fixed_noise, (True, False))
-        require_range("guidance.noise_offset", self.noise_offset, low=0, example=0.1)
+        require_range("guidance.noise_offset", self.noise_offset, low=0)
         require_choice("guidance.reduction", self.reduction, list(DIVISORS))
 
     def __call__(

@@ -37,10 +37,10 @@ class ISM(GuidedDistillation):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range("guidance.inversion_stride", self.inversion_stride, above=0, high=1, example=0.2)
-        require_range("guidance.initial_noise", self.initial_noise, low=0, below=1, example=0.0)
-        require_range("guidance.noise_offset", self.noise_offset, low=0, example=0.1)
-        require_scheduled("guidance.delta", self.delta, above=0, high=1, example=0.05)
+        require_range("guidance.inversion_stride", self.inversion_stride, above=0, high=1)
+        require_range("guidance.initial_noise", self.initial_noise, low=0, below=1)
+        require_range("guidance.noise_offset", self.noise_offset, low=0)
+        require_scheduled("guidance.delta", self.delta, above=0, high=1)
 
     def compare(self, case: Case) -> Comparison:
         """Subtract the noise at s without a prompt from the guided noise at t, on one trajectory."""

@@ -57,11 +57,11 @@ class SDI(GuidedDistillation):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range("guidance.inversion_scale", self.inversion_scale, example=-7.5)
+        require_range("guidance.inversion_scale", self.inversion_scale)
         require_choice("guidance.inversion_grid", self.inversion_grid, GRIDS)
-        require_range("guidance.inversion_stride", self.inversion_stride, above=0, high=1, example=0.1)
-        require_range("guidance.overshoot", self.overshoot, low=0, below=1, example=0.033)
-        require_range("guidance.eta", self.eta, low=0, example=0.3)
+        require_range("guidance.inversion_stride", self.inversion_stride, above=0, high=1)
+        require_range("guidance.overshoot", self.overshoot, low=0, below=1)
+        require_range("guidance.eta", self.eta, low=0)
 
     def compare(self, case: Case) -> Comparison:
         """Subtract the noise that the inversion found from the guided noise."""

@@ -56,9 +56,9 @@ class UCM(GuidedDistillation):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_whole("guidance.inversion_steps", self.inversion_steps, low=1, high=1000, example=3)
+        require_whole("guidance.inversion_steps", self.inversion_steps, low=1, high=1000)
         require_choice("guidance.inversion_grid", self.inversion_grid, list(GRIDS))
-        require_range("guidance.fresh_noise", self.fresh_noise, low=0, high=1, example=0.0)
+        require_range("guidance.fresh_noise", self.fresh_noise, low=0, high=1)
 
     def compare(self, case: Case) -> Comparison:
         """Subtract the velocity of the coupled pair from the guided velocity."""

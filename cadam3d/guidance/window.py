@@ -24,8 +24,8 @@ class WindowedGuidance(Guidance):
 
     def __post_init__(self) -> None:
         require_choice("guidance.shared_t", self.shared_t, (True, False))
-        require_scheduled("guidance.t_min", self.t_min, example=0.02)
-        require_scheduled("guidance.t_max", self.t_max, example=0.98)
+        require_scheduled("guidance.t_min", self.t_min)
+        require_scheduled("guidance.t_max", self.t_max)
         # At the steps in between, the two may cross. These are checked when training reaches them.
         for step in (0, FAR_STEP):
             self.window(step)

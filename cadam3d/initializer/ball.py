@@ -22,8 +22,8 @@ class Ball(FromPoints):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_count(self.count, self.sh_degree)
-        require_range("initializer.radius", self.radius, above=0, high=1, example=0.6)
-        require_range("initializer.color_noise", self.color_noise, low=0, high=1, example=0.1)
+        require_range("initializer.radius", self.radius, above=0, high=1)
+        require_range("initializer.color_noise", self.color_noise, low=0, high=1)
         require_color("initializer.color", self.color)
 
     def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:

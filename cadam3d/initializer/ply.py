@@ -53,7 +53,7 @@ class Ply(FromObject):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.count is not None:
-            require_whole("initializer.count", self.count, low=1, example=2000)
+            require_whole("initializer.count", self.count, low=1)
         if self.up is not None:
             require_choice("initializer.up", self.up, UPS)
         require_copies(self.replicate, self.replicate_radius, self.replicate_law)
@@ -75,7 +75,6 @@ class Ply(FromObject):
             "initializer.replicate",
             expected="1, since this file holds Gaussians",
             got=self.replicate,
-            example="initializer.replicate=1",
         )
         asset = turned(read_gaussians(path, up=self.up), self.turn_deg)
         _require_finite(path, "means", asset.means)

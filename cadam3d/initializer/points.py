@@ -72,10 +72,10 @@ class FromPoints(Initializer):
 
     def __post_init__(self) -> None:
         if self.scale is not None:
-            require_range("initializer.scale", self.scale, above=0, example=0.03)
+            require_range("initializer.scale", self.scale, above=0)
         require_choice("initializer.scale_law", self.scale_law, SCALE_LAWS)
-        require_range("initializer.opacity", self.opacity, above=0, below=1, example=0.1)
-        require_whole("initializer.sh_degree", self.sh_degree or 0, low=0, high=MAX_DEGREE, example=0)
+        require_range("initializer.opacity", self.opacity, above=0, below=1)
+        require_whole("initializer.sh_degree", self.sh_degree or 0, low=0, high=MAX_DEGREE)
 
     def gaussians_at(self, cloud: PointCloud, device: torch.device) -> Gaussians:
         """Return Gaussians on ``device`` at the points of a cloud."""
@@ -98,9 +98,9 @@ class FromObject(FromPoints):
         super().__post_init__()
         require_choice("initializer.turn_deg", self.turn_deg, TURNS)
         if self.radius is not None:
-            require_range("initializer.radius", self.radius, above=0, high=1, example=0.9)
+            require_range("initializer.radius", self.radius, above=0, high=1)
         if self.factor is not None:
-            require_range("initializer.factor", self.factor, above=0, high=1000, example="null")
+            require_range("initializer.factor", self.factor, above=0, high=1000)
             require(
                 self.radius is None,
                 "initializer.radius",
@@ -108,7 +108,7 @@ class FromObject(FromPoints):
                 got=self.radius,
                 example="initializer.radius=null",
             )
-        require_range("initializer.lift", self.lift, low=-1, high=1, example=0)
+        require_range("initializer.lift", self.lift, low=-1, high=1)
 
     def placement(self, points: Float[Tensor, "n 3"]) -> Placement:
         """Return how to move the points of the object into the world.
@@ -288,14 +288,14 @@ def require_count(count: int, sh_degree: int | None) -> None:
 
     Each number of a Gaussian is stored with its gradient and its two moments, in single precision.
     """
-    require_whole("initializer.count", count, low=1, example=2000)
+    require_whole("initializer.count", count, low=1)
     numbers = 11 + 3 * ((sh_degree or 0) + 1) ** 2
-    require_memory("initializer.count", count, unit=16 * numbers, example=2000)
+    require_memory("initializer.count", count, unit=16 * numbers)
 
 
 def require_copies(replicate: int, replicate_radius: object, replicate_law: object) -> None:
     """Raise ``UserError`` unless ``replicate`` is at least 1, its radius in (0, 1] and its law known."""
-    require_whole("initializer.replicate", replicate, low=1, example=20)
-    require_memory("initializer.replicate", replicate, unit=16 * 14, example=20)
-    require_range("initializer.replicate_radius", replicate_radius, above=0, high=1, example=0.05)
+    require_whole("initializer.replicate", replicate, low=1)
+    require_memory("initializer.replicate", replicate, unit=16 * 14)
+    require_range("initializer.replicate_radius", replicate_radius, above=0, high=1)
     require_choice("initializer.replicate_law", replicate_law, REPLICATE_LAWS)

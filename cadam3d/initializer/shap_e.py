@@ -80,15 +80,15 @@ class ShapE(FromObject):
         is_text = self.prompt is None or (isinstance(self.prompt, str) and self.prompt.strip() != "")
         example = "initializer.prompt=null"
         require(is_text, "initializer.prompt", expected="text or null", got=self.prompt, example=example)
-        require_whole("initializer.steps", self.steps, low=1, high=1024, example=64)
-        require_range("initializer.guidance_scale", self.guidance_scale, low=1, example=15)
-        require_whole("initializer.grid_size", self.grid_size, low=2, example=128)
-        require_memory("initializer.grid_size", self.grid_size, unit=4, power=3, example=128)
+        require_whole("initializer.steps", self.steps, low=1, high=1024)
+        require_range("initializer.guidance_scale", self.guidance_scale, low=1)
+        require_whole("initializer.grid_size", self.grid_size, low=2)
+        require_memory("initializer.grid_size", self.grid_size, unit=4, power=3)
         require_count(1 if self.count is None else self.count, self.sh_degree)
-        require_whole("initializer.grow_points", self.grow_points, low=0, example=1000000)
-        require_memory("initializer.grow_points", self.grow_points, unit=12, example=1000000)
-        require_range("initializer.grow_distance", self.grow_distance, above=0, example=0.01)
-        require_range("initializer.grow_noise", self.grow_noise, low=0, high=1, example=0.2)
+        require_whole("initializer.grow_points", self.grow_points, low=0)
+        require_memory("initializer.grow_points", self.grow_points, unit=12)
+        require_range("initializer.grow_distance", self.grow_distance, above=0)
+        require_range("initializer.grow_noise", self.grow_noise, low=0, high=1)
         require_choice("initializer.tone", self.tone, TONES)
         if self.color is not None:
             require_color("initializer.color", self.color)
@@ -98,7 +98,6 @@ class ShapE(FromObject):
             "initializer.fallback",
             expected="an initializer or null",
             got=self.fallback,
-            example="initializer/fallback=ball",
         )
 
     def begin(self, prompt: str, generator: torch.Generator, device: torch.device) -> Beginning:

@@ -68,7 +68,7 @@ class Fidelity(HeldOutSettings, Metric):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_whole("metric.fidelity.size", self.size, low=SSIM_WINDOW, example=128)
+        require_whole("metric.fidelity.size", self.size, low=SSIM_WINDOW)
 
     def measure(self, measurand: Measurand) -> Measurement:
         """Return PSNR, SSIM and the mode that they belong to; nothing if there are no true images.

@@ -23,8 +23,8 @@ class HeldOutSettings(PictureSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_views(self.views, example=12)
-        self.require_angles("elevations_deg", self.elevations_deg, limit=90, example=15)
+        self.require_views(self.views)
+        self.require_angles("elevations_deg", self.elevations_deg, limit=90)
 
     def cameras(self) -> Cameras:
         """Return the held-out views.

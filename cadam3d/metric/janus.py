@@ -78,8 +78,8 @@ class Janus(ClipMetric):
 
     def __post_init__(self) -> None:
         require_choice("metric.janus.by", self.by, WAYS)
-        require_whole("metric.janus.views", self.views, low=6, high=MOST_VIEWS, example=24)
-        require_range("metric.janus.elevation_deg", self.elevation_deg, low=-90, high=90, example=15)
+        require_whole("metric.janus.views", self.views, low=6, high=MOST_VIEWS)
+        require_range("metric.janus.elevation_deg", self.elevation_deg, low=-90, high=90)
 
     def prepare(self) -> None:
         """Find the files of the model if ``by=model``. With ``by=auto``, the truth may replace it."""

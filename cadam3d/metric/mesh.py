@@ -68,9 +68,9 @@ class MeshMetric(SurfaceSettings, Metric):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range("metric.mesh.threshold", self.threshold, above=0, high=10, example=0.02)
-        require_whole("metric.mesh.samples", self.samples, low=100, high=10_000_000, example=50000)
-        require_whole("metric.mesh.seed", self.seed, low=0, high=2**62, example=0)
+        require_range("metric.mesh.threshold", self.threshold, above=0, high=10)
+        require_whole("metric.mesh.samples", self.samples, low=100, high=10_000_000)
+        require_whole("metric.mesh.seed", self.seed, low=0, high=2**62)
 
     def measure(self, measurand: Measurand) -> Measurement:
         """Return the four numbers of the class; nothing if the true shape is not known.

@@ -45,7 +45,6 @@ class Niqe(ScoreMetric):
             "metric.niqe.parameters",
             expected="a file or null",
             got=self.parameters,
-            example="metric.niqe.parameters=null",
         )
 
     def prepare(self) -> None:

@@ -127,8 +127,8 @@ class RingProtocol(Protocol):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_views(self.views, example=12)
-        self.require_angles("elevations_deg", self.elevations_deg, limit=90, example=15)
+        self.require_views(self.views)
+        self.require_angles("elevations_deg", self.elevations_deg, limit=90)
         require_choice("protocol.aggregation", self.aggregation, AGGREGATIONS)
 
     @cached_property
@@ -164,8 +164,8 @@ class SphereProtocol(Protocol):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_whole("protocol.subdivisions", self.subdivisions, low=0, high=4, example=2)
-        require_whole("protocol.rounds", self.rounds, low=0, high=100, example=3)
+        require_whole("protocol.subdivisions", self.subdivisions, low=0, high=4)
+        require_whole("protocol.rounds", self.rounds, low=0, high=100)
         for each in self.other_fovs_y_deg:
             is_angle = isinstance(each, int | float) and 0 < each < 180
             example = "'protocol.other_fovs_y_deg=[45,30]'"

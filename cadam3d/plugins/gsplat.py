@@ -55,9 +55,9 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
     reset_min_age: int | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        require_whole("refine_every", self.refine_every, low=1, example=100)
-        require_whole("reset_every", self.reset_every, low=1, example=3000)
-        require_range("prune_opa", self.prune_opa, low=0, below=1 / RESET_OVER_PRUNE, example=0.005)
+        require_whole("refine_every", self.refine_every, low=1)
+        require_whole("reset_every", self.reset_every, low=1)
+        require_range("prune_opa", self.prune_opa, low=0, below=1 / RESET_OVER_PRUNE)
         require(
             self.prune_opa > 0 or self.reset == "none",
             "prune_opa",

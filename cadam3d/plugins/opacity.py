@@ -20,7 +20,7 @@ def reset_opacities(
     gradient of ``logits`` is dropped, for trainers that step the optimizer after the reset. Returns the
     number of lowered opacities.
     """
-    require_range("value", value, above=0, below=1, example=0.01)
+    require_range("value", value, above=0, below=1)
     require(
         logits.shape[:1] == rows.shape and logits.numel() == rows.numel(),
         "rows",

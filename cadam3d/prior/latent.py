@@ -128,7 +128,7 @@ class LatentPrior(DiffusionPrior):
         if self.size is not None:
             # Every model accepts 64 pixels, and the next smaller size if it accepts this one.
             unit = 2 * FACTOR
-            require_whole("prior.size", self.size, low=unit, example=64)
+            require_whole("prior.size", self.size, low=unit)
             require(
                 self.size % unit == 0,
                 "prior.size",
@@ -139,7 +139,7 @@ class LatentPrior(DiffusionPrior):
         require_choice("prior.noise_levels", self.noise_levels, LEVELS)
         require_choice("prior.dtype", self.dtype, ("auto", *DTYPES))
         if self.micro_batch is not None:
-            require_whole("prior.micro_batch", self.micro_batch, low=1, example=1)
+            require_whole("prior.micro_batch", self.micro_batch, low=1)
         require_choice("prior.text_device", self.text_device, ("auto", "cpu"))
         require_choice("prior.tiling", self.tiling, (False, True))
         require_choice("prior.compile", self.compile, (False, True))

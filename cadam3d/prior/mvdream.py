@@ -73,15 +73,9 @@ class MVDream(StableDiffusion):
             example=f"prior.micro_batch={VIEWS}",
         )
         super().__post_init__()
-        require_range("prior.rescale", self.rescale, low=0, high=1, example=0.5)
+        require_range("prior.rescale", self.rescale, low=0, high=1)
         is_name = isinstance(self.tokenizer, str) and self.tokenizer != ""
-        require(
-            is_name,
-            "prior.tokenizer",
-            expected="a folder or a name on the hub",
-            got=self.tokenizer,
-            example="prior.tokenizer=openai/clip-vit-large-patch14",
-        )
+        require(is_name, "prior.tokenizer", expected="a folder or a name on the hub", got=self.tokenizer)
 
     @cached_property
     def found(self) -> Pretrained:

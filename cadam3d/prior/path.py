@@ -116,9 +116,9 @@ class DDPM(NoisePath):
     beta_end: float = 0.012
 
     def __post_init__(self) -> None:
-        require_whole("prior.noise_path.train_steps", self.train_steps, low=1, example=1000)
-        require_range("prior.noise_path.beta_start", self.beta_start, above=0, below=1, example=0.00085)
-        require_range("prior.noise_path.beta_end", self.beta_end, low=self.beta_start, below=1, example=0.012)
+        require_whole("prior.noise_path.train_steps", self.train_steps, low=1)
+        require_range("prior.noise_path.beta_start", self.beta_start, above=0, below=1)
+        require_range("prior.noise_path.beta_end", self.beta_end, low=self.beta_start, below=1)
 
     def a(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
         """Return sqrt(alpha_bar), which is 1 at t = 0."""
@@ -164,7 +164,7 @@ class RectifiedFlow(NoisePath):
     shift: float = 1.0
 
     def __post_init__(self) -> None:
-        require_range("prior.noise_path.shift", self.shift, above=0, example=1.0)
+        require_range("prior.noise_path.shift", self.shift, above=0)
 
     def a(self, t: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
         """Return 1 - sigma."""

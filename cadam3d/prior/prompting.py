@@ -73,9 +73,9 @@ class Discrete(Prompting):
     overhead_deg: float
 
     def __post_init__(self) -> None:
-        require_range("prompting.front_deg", self.front_deg, low=0, high=180, example=45)
-        require_range("prompting.back_deg", self.back_deg, low=0, high=180, example=45)
-        require_range("prompting.overhead_deg", self.overhead_deg, low=-90, high=90, example=60)
+        require_range("prompting.front_deg", self.front_deg, low=0, high=180)
+        require_range("prompting.back_deg", self.back_deg, low=0, high=180)
+        require_range("prompting.overhead_deg", self.overhead_deg, low=-90, high=90)
         require(
             self.front_deg + self.back_deg <= 180,
             "prompting.back_deg",
@@ -106,8 +106,8 @@ class Compass(Prompting):
     above_deg: float
 
     def __post_init__(self) -> None:
-        require_range("prompting.below_deg", self.below_deg, low=-90, high=90, example=-5)
-        require_range("prompting.above_deg", self.above_deg, low=-90, high=90, example=35)
+        require_range("prompting.below_deg", self.below_deg, low=-90, high=90)
+        require_range("prompting.above_deg", self.above_deg, low=-90, high=90)
         require(
             self.below_deg <= self.above_deg,
             "prompting.above_deg",
@@ -171,7 +171,7 @@ class PerpNeg(Prompting):
     def __post_init__(self) -> None:
         require_choice("prompting.curve", self.curve, ("lucid", "threestudio"))
         if self.overhead_deg is not None:
-            require_range("prompting.overhead_deg", self.overhead_deg, low=-90, high=90, example=60)
+            require_range("prompting.overhead_deg", self.overhead_deg, low=-90, high=90)
 
     def texts(self, prompt: str) -> list[str]:
         """Return the prompt with each of the four suffixes."""

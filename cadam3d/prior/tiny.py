@@ -68,7 +68,7 @@ class Tiny(DiffusionPrior):
         require_choice("prior.predicts", self.predicts, ("noise", "velocity"))
         require_choice("prior.width", self.width, range(16, 49, GROUPS))
         require_choice("prior.downscale", self.downscale, range(1, 9))
-        require_whole("prior.seed", self.seed, low=0, high=2**62, example=0)
+        require_whole("prior.seed", self.seed, low=0, high=2**62)
 
     @cached_property
     def network(self) -> "TinyUNet":

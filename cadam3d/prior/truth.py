@@ -62,9 +62,9 @@ class ShapesTruth(TruthSource):
     tracer: str  # of TRACERS
 
     def __post_init__(self) -> None:
-        require_whole("truth.samples_per_pixel", self.samples_per_pixel, low=1, high=8, example=2)
+        require_whole("truth.samples_per_pixel", self.samples_per_pixel, low=1, high=8)
         if self.turns is not None:
-            require_whole("truth.turns", self.turns, low=2, high=MOST_TURNS, example=24)
+            require_whole("truth.turns", self.turns, low=2, high=MOST_TURNS)
         require_choice("truth.tracer", self.tracer, TRACERS)
 
     def of(self, prompt: str, prior: DiffusionPrior) -> Truth:

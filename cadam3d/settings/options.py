@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from hydra.utils import get_object
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import read_text, read_yaml
@@ -140,6 +142,10 @@ def example_value(key: str) -> Any:
         if reference := REFERENCE.fullmatch(str(found)):
             with suppress(LookupError):
                 return example_value(reference.group(1))
+        if "${" in str(found) and not reference:
+            with suppress(OmegaConfBaseException):
+                train = read_yaml(config_dir() / "train.yaml")
+                found = OmegaConf.select(OmegaConf.create({**train, **values}), key)
         if _is_typed(found):
             return found
     raise LookupError(key)
@@ -158,6 +164,12 @@ def example_word(key: str) -> str:
     except LookupError:
         root = key.partition(".")[0]
         return option_word(root) if option_names(root) else ""
+
+
+def with_example(error: UserError) -> UserError:
+    """Return an error with what to type, if it lacks this and the YAML files have an example for its key."""
+    word = example_word(error.key) if error.key else ""
+    return UserError(f"{error} Try: {word}") if word else error
 
 
 def argument(key: str, value: Any) -> str:

@@ -141,7 +141,7 @@ def analyse(raters: Sequence[Rater], *, least_caught: float) -> Analysis:
     A rater is excluded if the share of right answers in catch trials is below ``least_caught``, in [0, 1]. A
     rater who has seen no catch trial is kept. Raises ``UserError`` if no answer is left.
     """
-    require_range("least_caught", least_caught, low=0, high=1, example=0.8)
+    require_range("least_caught", least_caught, low=0, high=1)
     screening = screen(raters, least_caught)
     kept = {rater.name for rater in screening.kept}
     answers = [answer for rater in raters if rater.name in kept for answer in rater.answers]

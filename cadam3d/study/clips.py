@@ -45,13 +45,13 @@ class ClipSettings:
     quality: int  # of WebP, in [1, 100]
 
     def __post_init__(self) -> None:
-        require_whole("size", self.size, low=1, high=LARGEST, example=384)
-        require_whole("frames", self.frames, low=1, high=MOST_FRAMES, example=72)
-        require_range("seconds", self.seconds, low=0.5, high=60, example=6.0)
-        require_range("elevation_deg", self.elevation_deg, low=-90, high=90, example=20.0)
-        require_range("distance", self.distance, above=0, high=1000, example=3.0)
+        require_whole("size", self.size, low=1, high=LARGEST)
+        require_whole("frames", self.frames, low=1, high=MOST_FRAMES)
+        require_range("seconds", self.seconds, low=0.5, high=60)
+        require_range("elevation_deg", self.elevation_deg, low=-90, high=90)
+        require_range("distance", self.distance, above=0, high=1000)
         require_color("backdrop", self.backdrop)
-        require_whole("quality", self.quality, low=1, high=100, example=80)
+        require_whole("quality", self.quality, low=1, high=100)
 
     def cameras(self) -> Cameras:
         """Return the cameras of all frames, evenly spaced over one turn that begins at the front."""

@@ -91,7 +91,6 @@ def find_runs(places: Sequence[str], labels: Sequence[str] | None) -> Found:
             "labels",
             expected=f"{len(folders)} different texts of 1 to {LONGEST_LABEL} characters, one for each arm",
             got=names,
-            example="labels=null",
         )
     runs = [
         StudyRun(folder, name, str(summary["prompt"]), int(summary["seed"]))

@@ -80,9 +80,9 @@ def read_attempts(cfg: DictConfig, overrides: Sequence[str], options: Namespace)
     ``select=``, so that more attempts, or a choice by another number, find the attempts that exist. Raises
     ``UserError`` for settings that cannot be combined with attempts.
     """
-    require_whole("seed", cfg.seed, low=0, example=3)
+    require_whole("seed", cfg.seed, low=0)
     if cfg.get("resume") is not None:
-        raise fail("attempts", expected="1 with resume=", got=cfg.attempts, example="attempts=1")
+        raise fail("attempts", expected="1 with resume=", got=cfg.attempts)
     parts = sort_overrides([override for override in overrides if key_of(override) not in OF_THE_LINE])
     common = [override for override in parts.jobs if key_of(override) != "seed"]
     # Attempts that YAML files ask for would otherwise start attempts themselves.

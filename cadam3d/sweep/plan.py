@@ -301,7 +301,7 @@ def compose_all(jobs: Sequence[Job], composer: Composer) -> list[Composed]:
 
 def require_attempts(attempts: object) -> None:
     """Raise ``UserError`` for a wrong value of the setting ``attempts``."""
-    require_whole("attempts", attempts, low=1, high=MOST_ATTEMPTS, example=4)
+    require_whole("attempts", attempts, low=1, high=MOST_ATTEMPTS)
 
 
 def _refuse_attempts(job: Composed) -> None:

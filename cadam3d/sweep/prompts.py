@@ -67,7 +67,7 @@ def read_choice(node: Mapping[Any, Any] | None, default: str | None = None) -> P
     expected = f"a file, or one of the sets {'|'.join(set_names())}"
     require(_is_text(source), KEY, expected=expected, got=source, example=f"{KEY}={set_names()[0]}")
     if first is not None:
-        require_whole(FIRST, first, low=1, example=6)
+        require_whole(FIRST, first, low=1)
     if category is not None:
         example = f"{CATEGORY}=Material"
         require(_is_text(category), CATEGORY, expected="a category", got=category, example=example)

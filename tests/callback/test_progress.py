@@ -166,7 +166,7 @@ def test_disabled_progress_prints_nothing(run, lines, capsys, monkeypatch):
 @pytest.mark.parametrize("key", ["refresh_seconds", "line_seconds"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -1, True])
 def test_times_that_are_no_numbers_are_refused(key, value):
-    with pytest.raises(UserError, match=rf"^callback\.progress\.{key}: expected a number >= 0, got .* Try: "):
+    with pytest.raises(UserError, match=rf"^callback\.progress\.{key}: expected a number >= 0, got "):
         Progress(**{"refresh_seconds": 0.5, "line_seconds": 10, key: value})
 
 

@@ -9,22 +9,22 @@ from cadam3d.core.errors import UserError
 
 
 def test_a_message_has_key_expected_got_and_what_to_type():
-    message = str(fail("densifier.tau_Q", expected="a number >= 0", got=-1, example="densifier.tau_Q=0.9"))
-    assert message == "densifier.tau_Q: expected a number >= 0, got -1. Try: densifier.tau_Q=0.9"
+    message = str(fail("densifier.tau_Q", expected="a number >= 0", got=-1))
+    assert message == "densifier.tau_Q: expected a number >= 0, got -1."
 
 
 @pytest.mark.parametrize("value", [-1e-9, 1, 1.0, math.nan, math.inf, -math.inf, None, "0.5", True, [0.5]])
 def test_numbers_out_of_range_and_other_values_are_refused(value):
-    with pytest.raises(UserError, match=r"key: expected a number >= 0 and < 1, got .*\. Try: key=0.5"):
-        require_range("key", value, low=0, below=1, example=0.5)
+    with pytest.raises(UserError, match=r"key: expected a number >= 0 and < 1, got .*\.$"):
+        require_range("key", value, low=0, below=1)
 
 
 def test_bounds_are_closed_or_open_as_declared():
-    require_range("key", 3, low=3, high=3, example=3)
+    require_range("key", 3, low=3, high=3)
     with pytest.raises(UserError, match="> 3"):
-        require_range("key", 3, above=3, example=4)
+        require_range("key", 3, above=3)
     with pytest.raises(UserError, match="< 3"):
-        require_range("key", 3, below=3, example=2)
+        require_range("key", 3, below=3)
 
 
 @pytest.mark.parametrize(
@@ -32,10 +32,10 @@ def test_bounds_are_closed_or_open_as_declared():
 )
 def test_without_bounds_any_finite_number_passes(value, is_fine):
     if is_fine:
-        require_range("key", value, example=1)
+        require_range("key", value)
     else:
         with pytest.raises(UserError, match="a finite number"):
-            require_range("key", value, example=1)
+            require_range("key", value)
 
 
 @pytest.mark.parametrize(

@@ -52,11 +52,11 @@ def test_impossible_schedules_name_the_key(build, key):
     "value", [-1, 2.0, True, math.nan, Linear(start=1, end=-1, steps=10), Linear(start=2, end=1, steps=10)]
 )
 def test_numbers_and_schedules_that_start_or_end_outside_are_refused(value):
-    with pytest.raises(UserError, match=r"key: expected a number >= 0 and <= 1, got .*\. Try: key=0\.5"):
-        require_scheduled("key", value, low=0, high=1, example=0.5)
+    with pytest.raises(UserError, match=r"key: expected a number >= 0 and <= 1, got .*\.$"):
+        require_scheduled("key", value, low=0, high=1)
 
 
 @pytest.mark.parametrize("value", [None, "0.5", [0.5], {"start": 1.0}])
 def test_other_values_are_refused(value):
     with pytest.raises(UserError, match="key: expected a number or a schedule, got"):
-        require_scheduled("key", value, low=0, example=0.5)
+        require_scheduled("key", value, low=0)

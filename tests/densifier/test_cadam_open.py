@@ -235,5 +235,5 @@ def test_an_impossible_value_of_an_open_choice_is_refused_by_name(key, value):
     ],
 )
 def test_a_setting_without_effect_or_with_a_misleading_one_is_refused(changes, key):
-    with pytest.raises(UserError, match=rf"densifier\.{key}: expected .* Try: densifier\."):
+    with pytest.raises(UserError, match=rf"densifier\.{key}: expected "):
         open_cadam(**changes)

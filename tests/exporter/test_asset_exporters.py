@@ -44,7 +44,7 @@ def test_each_exporter_writes_its_file_and_nothing_else(tmp_path, name):
 
 @pytest.mark.parametrize("name", EXPORTERS)
 def test_a_wrong_axis_names_its_key(name):
-    with pytest.raises(UserError, match=rf"^{EXPORTERS[name][0].node}\.up: .*Try: exporter\."):
+    with pytest.raises(UserError, match=rf"^{EXPORTERS[name][0].node}\.up: "):
         built(name, up="up")
 
 

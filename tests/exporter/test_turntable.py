@@ -130,9 +130,7 @@ def test_assets_are_side_by_side_under_the_same_cameras_with_room_for_captions(t
 
 def test_a_frame_that_is_too_wide_for_the_codecs_is_refused_before_it_is_rendered(tmp_path):
     subjects = [Subject(no_gaussians(), Recorder(), "a")] * 3
-    with pytest.raises(
-        UserError, match=r"^exporter\.turntable\.size: expected at most \d+, .* Try: .*size=256"
-    ):
+    with pytest.raises(UserError, match=r"^exporter\.turntable\.size: expected at most \d+,"):
         TurntableExporter(**{**SETTINGS, "size": 4096}).compare(subjects, tmp_path)
 
 

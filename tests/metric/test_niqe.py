@@ -179,7 +179,7 @@ MEAN, COVARIANCE, WINDOW = np.zeros(36), np.eye(36), np.full((7, 7), 1 / 49)
 def test_files_without_the_right_entries_are_refused(tmp_path, entries, reason):
     file = tmp_path / "other.npz"
     np.savez(file, **dict(zip(natural.KEYS, entries, strict=False)))
-    with pytest.raises(UserError, match=f"{reason}.*Try: metric.niqe.parameters=null"):
+    with pytest.raises(UserError, match=f"{reason}"):
         metric(parameters=str(file)).scorer(torch.device("cpu"))
 
 

@@ -541,8 +541,8 @@ def test_the_settings_of_default_strategy_keep_their_names_and_defaults():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"tau_Q": 1.0}, r"^tau_Q: .*Try: tau_Q=0\.9$"),
-        ({"refine_every": 0}, r"^refine_every: .*Try: refine_every=100$"),
+        ({"tau_Q": 1.0}, r"^tau_Q: "),
+        ({"refine_every": 0}, r"^refine_every: "),
         ({"reset_every": 0}, "^reset_every: "),
         ({"prune_opa": 0.5}, "^prune_opa: "),
         ({"prune_opa": 0}, r'^prune_opa: .*Try: prune_opa=0, reset="none"$'),

