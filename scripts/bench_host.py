@@ -22,12 +22,25 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 
-from measuring import HERE, add_base, environment_of, find_trees
+from measuring import (
+    HERE,
+    add_base,
+    environment_of,
+    find_trees,
+    in_turns,
+    machine,
+    median,
+    new_file,
+    parser_of,
+    positive,
+    table,
+    write,
+)
 
 # Each Gaussian touches this many tiles in each view.
 TILES = 16
@@ -83,29 +96,38 @@ int cuGetErrorString(int, const char** text) { *text = "error"; return 0; }
 
 
 def main() -> None:
+    """Print the table."""
     args = read_arguments()
     if args.stub:
         print(json.dumps(measure(args)))
         return
-    trees = find_trees(args.base)
     with tempfile.TemporaryDirectory() as folder:
         stub = compile_stub(Path(folder))
-        rounds = [
-            {name: start(tree, stub, args) for name, tree in trees.items()} for _ in range(args.repeats)
-        ]
-    found = summarize(rounds)
-    print(json.dumps(found, indent=2) if args.json else as_text(found, args))
+        works = {name: partial(start, tree, stub, args) for name, tree in find_trees(args.base).items()}
+        found = {name: median(turns) for name, turns in in_turns(works, args.repeats).items()}
+    rows = [
+        {"": f"{tree}, {way}"} | {name: f"{number:.0f}" for name, number in numbers.items()}
+        for tree, ways in found.items()
+        for way, numbers in ways.items()
+    ]
+    for row, numbers in zip(rows, (each for ways in found.values() for each in ways.values()), strict=True):
+        if "base" in found:
+            row["to base, exact"] = f"{numbers['sum_us'] / found['base']['exact']['sum_us']:.2f}"
+    print(
+        f"{args.count} Gaussians, {args.views} views, {args.size} px, stub driver, CPU time\n\n{table(rows)}"
+    )
+    write(args.json, {"machine": machine(), **found})
 
 
 def read_arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = parser_of(__doc__)
     add_base(parser)
-    parser.add_argument("--count", type=int, default=20_000, help="Gaussians (default: 20000)")
-    parser.add_argument("--size", type=int, default=512, help="pixels along an edge (default: 512)")
-    parser.add_argument("--views", type=int, default=1, help="views (default: 1)")
-    parser.add_argument("--steps", type=int, default=200, help="passes in each process (default: 200)")
-    parser.add_argument("--repeats", type=int, default=5, help="processes of each tree (default: 5)")
-    parser.add_argument("--json", action="store_true", help="print numbers for programs")
+    parser.add_argument("--count", type=positive, default=20_000, help="Gaussians (default: 20000)")
+    parser.add_argument("--size", type=positive, default=512, help="pixels along an edge (default: 512)")
+    parser.add_argument("--views", type=positive, default=1, help="views (default: 1)")
+    parser.add_argument("--steps", type=positive, default=200, help="passes in each process (default: 200)")
+    parser.add_argument("--repeats", type=positive, default=5, help="processes of each tree (default: 5)")
+    parser.add_argument("--json", type=new_file, help="also write all numbers to this file")
     parser.add_argument("--stub", help=argparse.SUPPRESS)
     return parser.parse_args()
 
@@ -222,93 +244,27 @@ def time_step(forward: Callable, backward: Callable, stub: ctypes.CDLL, steps: i
         end = now()
         times["forward"].append(middle - begin)
         times["backward"].append(end - middle)
-    return {f"{name}_us": statistics.median(values) / 1e3 for name, values in times.items()}
+    found = {f"{name}_us": statistics.median(values) / 1e3 for name, values in times.items()}
+    return found | {"sum_us": sum(found.values())}
 
 
 def count_step(forward: Callable, backward: Callable, stub: ctypes.CDLL) -> dict[str, float]:
-    """Return the numbers of launches, torch operations, allocations and waits of one pass."""
+    """Return the numbers of launches and of torch operations of one pass."""
     from torch.utils._python_dispatch import TorchDispatchMode
 
-    calls: Counter[str] = Counter()
+    calls: list[str] = []
 
     class Count(TorchDispatchMode):
         def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-            name = func.__name__.partition(".")[0]
             # Views count too: they take no time on a device, but they do on the host.
-            calls["operations"] += 1
-            calls["allocations"] += name in ("empty", "new_empty", "empty_like", "empty_strided", "zeros")
+            calls.append(func.__name__)
             return func(*args, **(kwargs or {}))
 
     launches = ctypes.c_uint64.in_dll(stub, "stub_launches")
     before = launches.value
-    with Count(), counted_waits(calls):
+    with Count():
         backward(forward())
-    return {
-        "launches": launches.value - before,
-        **{name: calls[name] for name in ("operations", "allocations", "waits")},
-    }
-
-
-@contextmanager
-def counted_waits(calls: Counter[str]) -> Iterator[None]:
-    """Count the calls that read numbers of a tensor, each of which would wait for a device."""
-    import torch
-
-    originals = {name: getattr(torch.Tensor, name) for name in ("tolist", "item", "cpu")}
-
-    def counting(original: Callable) -> Callable:
-        def call(*args, **kwargs):
-            calls["waits"] += 1
-            return original(*args, **kwargs)
-
-        return call
-
-    for name, original in originals.items():
-        setattr(torch.Tensor, name, counting(original))
-    try:
-        yield
-    finally:
-        for name, original in originals.items():
-            setattr(torch.Tensor, name, original)
-
-
-def summarize(rounds: list[dict]) -> dict[str, dict[str, float]]:
-    """Return the medians over all processes, and the ratios to the exact way of the other tree."""
-    found: dict[str, dict] = {}
-    for tree, ways in rounds[0].items():
-        for way, numbers in ways.items():
-            medians = {name: statistics.median(each[tree][way][name] for each in rounds) for name in numbers}
-            found[f"{tree}, {way}"] = medians | {"sum_us": medians["forward_us"] + medians["backward_us"]}
-    if base := found.get("base, exact"):
-        for numbers in found.values():
-            numbers["to_base"] = numbers["sum_us"] / base["sum_us"]
-    return found
-
-
-def as_text(found: dict, args: argparse.Namespace) -> str:
-    """Return a table with a row for each tree and way to render."""
-    columns = (
-        "forward_us",
-        "backward_us",
-        "sum_us",
-        "to_base",
-        "launches",
-        "operations",
-        "allocations",
-        "waits",
-    )
-    scene = f"{args.count} Gaussians, {args.views} views, {args.size} px, stub driver, CPU time"
-    lines = [scene, f"{'':<14}" + "".join(f"{name:>13}" for name in columns)]
-    for name, numbers in found.items():
-        cells = (number_text(column, numbers.get(column)) for column in columns)
-        lines.append(f"{name:<14}" + "".join(f"{cell:>13}" for cell in cells))
-    return "\n".join(lines)
-
-
-def number_text(column: str, number: float | None) -> str:
-    if number is None:
-        return ""
-    return f"{number:.2f}" if column == "to_base" else f"{number:.0f}"
+    return {"launches": launches.value - before, "operations": len(calls)}
 
 
 if __name__ == "__main__":

@@ -184,42 +184,40 @@ def random_settings(prior: str, args: argparse.Namespace, folder: Path) -> list[
 
 
 def as_table(found: dict[str, Any]) -> str:
-    here = found["here"]
-    trees = list(found)
-    head = (
-        f"{here['prior']} prior, {here['gaussians']:,.0f} Gaussians, {here['views']} views of "
-        f"{here['size']} px, {here['backend']}"
-    )
-    columns = "".join(f"{tree + ' ms':>12}{'share':>8}{'ops':>8}{'reads':>7}" for tree in trees)
-    lines = [head, f"{'part':<14}{columns}"]
-    names = [name for name in ORDER if any(name in each["parts_ms"] for each in found.values())]
-    for name in names:
-        lines.append(f"{name:<14}" + "".join(as_cells(each, name) for each in found.values()))
-    sums = "".join(
-        f"{sum(each['parts_ms'].values()):>12.2f}{'':>8}{sum(each['operations'].values()):>8.0f}"
-        f"{sum(each['readbacks'].values()):>7.1f}"
-        for each in found.values()
-    )
-    lines.append(f"{'all parts':<14}{sums}")
-    for label, key in (("whole, wall", "wall_ms"), ("whole, CPU", "cpu_ms"), ("refinement", "refinement_ms")):
-        values = [each[key] for each in found.values()]
-        lines.append(f"{label:<14}" + "".join("" if v is None else f"{v:>12.2f}{'':>23}" for v in values))
-    for name in here["bytes_per_gaussian"]:
-        sizes = "".join(f"{each['bytes_per_gaussian'][name]:>12.0f}{'':>23}" for each in found.values())
-        lines.append(f"{name:<14}{sizes}".rstrip() + "  bytes per Gaussian")
-    if here["peak_bytes"] is not None:
-        lines.append(f"peak memory   {here['peak_bytes'] / 2**20:>12.0f} MiB")
+    """Return a table of the parts of a step, and below it the numbers of the whole step."""
+    here, rows = found["here"], []
+    for name in ORDER:
+        if any(name in each["parts_ms"] for each in found.values()):
+            rows.append(
+                {"part": name} | {k: v for tree, each in found.items() for k, v in cells(tree, each, name)}
+            )
+    lines = [
+        f"{here['prior']} prior, {here['gaussians']:,.0f} Gaussians, "
+        f"{here['views']} views of {here['size']} px, {here['backend']}",
+        f"\n{measuring.table(rows)}\n",
+    ]
+    for tree, each in found.items():
+        sizes = ", ".join(f"{name} {size:.0f}" for name, size in each["bytes_per_gaussian"].items())
+        peak = "" if each["peak_bytes"] is None else f"; peak memory {each['peak_bytes'] / 2**20:.0f} MiB"
+        lines.append(
+            f"{tree}: whole step {each['wall_ms']:.2f} ms by the clock, {each['cpu_ms']:.2f} ms of CPU time; "
+            f"refinement {each['refinement_ms']:.2f} ms; bytes per Gaussian: {sizes}{peak}"
+        )
     if "base" in found:
         ratios = [here[key] / found["base"][key] for key in ("wall_ms", "cpu_ms")]
         lines.append(f"here / base, whole step: wall {ratios[0]:.3f}, CPU {ratios[1]:.3f}")
     return "\n".join(lines)
 
 
-def as_cells(found: dict[str, Any], name: str) -> str:
+def cells(tree: str, found: dict[str, Any], name: str) -> list[tuple[str, str]]:
+    """Return the columns of one part in one checkout."""
     milliseconds = found["parts_ms"].get(name, 0.0)
-    share = 100 * milliseconds / sum(found["parts_ms"].values())
-    operations, readbacks = found["operations"].get(name, 0), found["readbacks"].get(name, 0)
-    return f"{milliseconds:>12.3f}{share:>6.1f} %{operations:>8.0f}{readbacks:>7.1f}"
+    share = milliseconds / sum(found["parts_ms"].values())
+    counts = [found[kind].get(name, 0) for kind in ("operations", "readbacks")]
+    values = (f"{milliseconds:.3f}", f"{share:.1%}", f"{counts[0]:.0f}", f"{counts[1]:.1f}")
+    return list(
+        zip((f"{tree} {title}" for title in ("ms", "share", "operations", "readbacks")), values, strict=True)
+    )
 
 
 if __name__ == "__main__":

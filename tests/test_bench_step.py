@@ -60,7 +60,7 @@ def test_every_part_of_a_step_is_measured_and_counted(tmp_path, capsys):
     assert "here / base, whole step" in table
     (found,) = json.loads((tmp_path / "step.json").read_text())["here"]
     assert set(found["parts_ms"]) == set(bench_step.ORDER)
-    assert all(f"\n{name} " in table for name in found["parts_ms"])
+    assert all(f"\n| {name} |" in table for name in found["parts_ms"])
     assert found["operations"]["render"] > 0
     assert found["readbacks"]["readback"] == 1
     sizes = {"parameters": 56, "gradients": 56, "moments": 112, "densifier": 28}

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
@@ -83,7 +83,9 @@ class Sweep:
     composed: list[Composed]  # the settings of each job
     figures: list[str] | None = None  # of its report; None: all for which there are data
     paper_table: bool = False
-    command: str = "sweep"  # of the line; "train" if the jobs are several attempts at one run
+    command: Literal["sweep", "train"] = (
+        "sweep"  # of the line; "train" if the jobs are several attempts at one run
+    )
 
     @property
     def is_dry(self) -> bool:
