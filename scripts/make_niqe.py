@@ -39,6 +39,8 @@ from cadam3d.metric.niqe import OWN_PARAMETERS
 DATA = Path(skimage.__file__).parent / "data"
 HALVED = ("astronaut", "camera", "chelsea", "coffee", "motorcycle_left", "coins", "gravel")
 WHOLE = Path(matplotlib.__file__).parent / "mpl-data/sample_data/grace_hopper.jpg"
+WINDOW = 7  # pixels
+WINDOW_SIGMA = 7 / 6  # pixels
 OFFSETS = (0, natural.BLOCK // 2)  # of the blocks, in both directions
 SHARPNESS = 0.4  # relative to the sharpest block of a photograph
 TESTS = Path(__file__).parent.parent / "tests"
@@ -54,7 +56,8 @@ def main() -> None:
     if folder is None:
         pristine = fitted(photographs())
         with replacing(OWN_PARAMETERS) as temporary:
-            natural.write(pristine, temporary)
+            values = (pristine.mean[None], pristine.covariance, pristine.window)
+            np.savez(temporary, **dict(zip(natural.KEYS, values, strict=True)))
         print(OWN_PARAMETERS)
         return
     with replacing(EXPECTED) as temporary:
@@ -75,9 +78,16 @@ def photographs() -> list[Float32[np.ndarray, "h w"]]:
     return found
 
 
+def gaussian_window() -> Float[np.ndarray, "k k"]:
+    """Return the weights of the local means, with sum 1."""
+    offsets = np.arange(WINDOW) - WINDOW // 2
+    row = np.exp(-(offsets**2) / (2 * WINDOW_SIGMA**2))
+    return np.outer(row, row) / row.sum() ** 2
+
+
 def fitted(photographs: list[Float32[np.ndarray, "h w"]]) -> natural.Pristine:
     """Return the Gaussian model of the sharp blocks (paper sec. II-B and II-E)."""
-    window = natural.gaussian_window()
+    window = gaussian_window()
     rows = [row for photograph in photographs for row in _sharp_blocks(photograph, window)]
     return natural.Pristine(np.mean(rows, axis=0), np.cov(rows, rowvar=False), window)
 

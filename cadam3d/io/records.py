@@ -41,14 +41,11 @@ def read_summary(run: Path) -> dict[str, Any]:
         summary = read_json(run / SUMMARY)
     except UserError:
         return {}
-    is_summary = isinstance(summary, dict) and all(
-        is_entry(summary[name]) for name, is_entry in SUMMARY_ENTRIES.items() if name in summary
-    )
-    return summary if is_summary and all(map(_is_number_or_none, _measured(summary))) else {}
-
-
-def _measured(summary: Mapping[str, Any]) -> list[Any]:
-    return [summary.get(name) for name in declared(summary)]
+    if not isinstance(summary, dict):
+        return {}
+    entries = dict.fromkeys(declared(summary), _is_number_or_none) | SUMMARY_ENTRIES
+    is_believed = all(is_entry(summary[name]) for name, is_entry in entries.items() if name in summary)
+    return summary if is_believed else {}
 
 
 def declared(facts: Mapping[str, Any]) -> dict[str, Number]:
@@ -57,11 +54,8 @@ def declared(facts: Mapping[str, Any]) -> dict[str, Number]:
     Declarations of another form than :meth:`Number.declaration` returns are left out.
     """
     entries = facts.get(NUMBERS)
-    found = (
-        {}
-        if not isinstance(entries, dict)
-        else {name: Number(name=name, **entry) for name, entry in entries.items() if _is_declaration(entry)}
-    )
+    pairs = entries.items() if isinstance(entries, dict) else ()
+    found = {name: Number(name=name, **entry) for name, entry in pairs if _is_declaration(entry)}
     return {COUNT.name: COUNT} | found
 
 
@@ -77,12 +71,6 @@ def psnr_of(summary: Mapping[str, Any]) -> float | None:
     """Return the PSNR by which an asset is judged, in dB: at the best turn, if it may face any side."""
     turned = summary.get("psnr_turned")
     return summary.get("psnr") if turned is None else turned
-
-
-def ssim_of(summary: Mapping[str, Any]) -> float | None:
-    """Return the SSIM by which an asset is judged: at the best turn, if it may face any side."""
-    turned = summary.get("ssim_turned")
-    return summary.get("ssim") if turned is None else turned
 
 
 def read_evaluation(run: Path, summary: Mapping[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import torch
 from cadam3d.core.checks import require, require_choice
 from cadam3d.core.errors import UserError
 from cadam3d.core.number import Number
-from cadam3d.io.pretrained import fetch_file, read_tensors
+from cadam3d.io.pretrained import fetch_file, read_tensors, short
 from cadam3d.metric.clip import Clip, ClipMetric, assembled, check_clip, load_clip
 from cadam3d.metric.open_clip import clip_model
 from cadam3d.metric.scoring import Scorer
@@ -110,9 +110,8 @@ def _loaded(
     except (ValueError, RuntimeError, TypeError, KeyError) as error:
         if isinstance(error, torch.OutOfMemoryError):
             raise
-        reason = " ".join(str(error).split())[:200]
         raise UserError(
-            f"{Hps.node}.model: {file} does not fit {Hps.node}.base={base.source.model} ({reason}). "
+            f"{Hps.node}.model: {file} does not fit {Hps.node}.base={base.source.model} ({short(error)}). "
             f"Try: {Hps.node}.model=null"
         ) from error
     return assembled(base, model, dict(facts), device)

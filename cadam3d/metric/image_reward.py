@@ -17,6 +17,7 @@ from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
 from cadam3d.core.number import Number
 from cadam3d.io.image import to_uint8
+from cadam3d.io.pretrained import short
 from cadam3d.metric.scoring import ScoreMetric, Scorer, cut_off
 from cadam3d.metric.transformer import sha256_of
 
@@ -85,7 +86,7 @@ class ImageReward(ScoreMetric):
         except Exception as error:
             if isinstance(error, torch.OutOfMemoryError):
                 raise
-            raise self._missing(" ".join(str(error).split())[:200]) from error
+            raise self._missing(short(error)) from error
 
     def _named(self) -> tuple[str, str | None, str | None]:
         """Return what the package calls name, download_root and med_config; with NAME, it downloads."""
@@ -113,9 +114,8 @@ def _package(key: str) -> Any:
         return import_module(MODULE)
     # A package with old requirements fails in many ways beside new libraries.
     except Exception as error:
-        reason = " ".join(str(error).split())[:200]
         raise UserError(
-            f"{key}: the package {PACKAGE} cannot be imported ({reason}). "
+            f"{key}: the package {PACKAGE} cannot be imported ({short(error)}). "
             f"Try, in a new environment: {INSTALL}"
         ) from error
 

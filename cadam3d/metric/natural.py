@@ -15,7 +15,6 @@ number and zero, and the shapes come from a grid, so the precision is visible in
 import io
 import warnings
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -27,8 +26,6 @@ from cadam3d.core.errors import UserError
 BLOCK = 96  # pixels, at the first scale
 SCALES = 2
 NUM_FEATURES = 36  # 18 per scale
-WINDOW = 7  # pixels
-WINDOW_SIGMA = 7 / 6  # pixels
 # Weights of red, green and blue in the luma of an image in [0, 1].
 LUMA = np.array([65.481, 128.553, 24.966])
 LUMA_BLACK = 16.0
@@ -52,13 +49,6 @@ class Pristine:
     mean: Float[np.ndarray, "f"]
     covariance: Float[np.ndarray, "f f"]
     window: Float[np.ndarray, "k k"]
-
-
-def gaussian_window() -> Float[np.ndarray, "k k"]:
-    """Return the weights of the local means, with sum 1."""
-    offsets = np.arange(WINDOW) - WINDOW // 2
-    row = np.exp(-(offsets**2) / (2 * WINDOW_SIGMA**2))
-    return np.outer(row, row) / row.sum() ** 2
 
 
 def luma(image: Float[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
@@ -111,25 +101,20 @@ def read(content: bytes, where: str, key: str) -> Pristine:
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             mean, covariance, window = (np.asarray(file[name], dtype=np.float64) for name in KEYS)
+        shapes = (mean.size, covariance.shape, window.ndim)
+        if shapes != (NUM_FEATURES, (NUM_FEATURES, NUM_FEATURES), 2):
+            raise ValueError(f"their shapes are {mean.shape}, {covariance.shape} and {window.shape}")
+        if not all(np.isfinite(values).all() for values in (mean, covariance, window)):
+            raise ValueError("some of their values are not finite")
     # A damaged file makes its reader raise almost anything.
     except Exception as error:
-        reason = " ".join(str(error).split())[:120]
         # NumPy's message recommends running what is in the file.
-        if "pickle" in reason:
-            reason = "it contains something other than numbers"
-        raise _unlike(key, where, reason) from error
-    shapes = (mean.size, covariance.shape, window.ndim)
-    if shapes != (NUM_FEATURES, (NUM_FEATURES, NUM_FEATURES), 2):
-        raise _unlike(key, where, f"their shapes are {mean.shape}, {covariance.shape} and {window.shape}")
-    if not all(np.isfinite(values).all() for values in (mean, covariance, window)):
-        raise _unlike(key, where, "some of their values are not finite")
+        reason = " ".join(str(error).partition("allow_pickle")[0].split())[:120]
+        raise UserError(
+            f"{key}: expected a file with {', '.join(KEYS)}, as basicsr's niqe_pris_params.npz has them, got "
+            f"{where!r} ({reason}). Try: {key}=null"
+        ) from error
     return Pristine(mean.reshape(-1), covariance, window)
-
-
-def write(pristine: Pristine, path: Path) -> None:
-    """Write parameters in the format that :func:`read` reads."""
-    values = (pristine.mean[None], pristine.covariance, pristine.window)
-    np.savez(path, **dict(zip(KEYS, values, strict=True)))
 
 
 def cropped(image: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "a b"]:
@@ -203,10 +188,3 @@ def _moments(values: Float32[np.ndarray, "n"]) -> tuple[np.floating, np.floating
     """Return the root mean squares of the negative and of the positive values, and the ratio of moments."""
     left, right = (np.sqrt(np.mean(values[side] ** 2)) for side in (values < 0, values > 0))
     return left, right, np.mean(np.abs(values)) ** 2 / np.mean(values**2)
-
-
-def _unlike(key: str, where: str, reason: str) -> UserError:
-    return UserError(
-        f"{key}: expected a file with {', '.join(KEYS)}, as basicsr's niqe_pris_params.npz has them, got "
-        f"{where!r} ({reason}). Try: {key}=null"
-    )

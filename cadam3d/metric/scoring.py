@@ -17,6 +17,7 @@ from torch import Tensor
 from cadam3d.core.errors import UserError
 from cadam3d.core.memory import is_out_of_memory
 from cadam3d.core.number import Number
+from cadam3d.io.pretrained import short
 from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.protocol import ModelName, Protocol
 from cadam3d.metric.transformer import TransformerFolder, TransformerSource
@@ -79,9 +80,8 @@ class ScoreMetric(Metric):
         except Exception as error:
             if is_out_of_memory(error) or isinstance(error, UserError):
                 raise
-            reason = " ".join(str(error).split())[:200]
             raise UserError(
-                f"metric.{self.number.name}: the model cannot score this prompt ({reason}). "
+                f"metric.{self.number.name}: the model cannot score this prompt ({short(error)}). "
                 "Try: another model"
             ) from error
 
