@@ -126,9 +126,9 @@ def _parse_header(path: Path, file: BinaryIO) -> PlyHeader:
     for words in _header_lines(path, file):
         match words:
             case ["format", *version] if encoding is None:
-                encoding = _require_encoding(path, " ".join(version))
+                encoding = _require_one_of(path, ENCODINGS, "format", " ".join(version))
             case ["comment", "cadam3d", claim] if claim.startswith("up="):
-                ups.add(_require_up(path, claim.removeprefix("up=")))
+                ups.add(_require_one_of(path, UPS, "up", claim.removeprefix("up=")))
             case ["element", name, count] if encoding and count.isdecimal() and len(count) <= MAX_DIGITS:
                 elements.append((name, int(count), []))
             case ["property", *kind, name] if elements and (found := _kind(kind)):
@@ -178,16 +178,11 @@ def _header_lines(path: Path, file: BinaryIO) -> Iterator[list[str]]:
     raise unusable(path, "truncated: the header has no end")
 
 
-def _require_encoding(path: Path, version: str) -> str:
-    if version not in ENCODINGS:
-        raise unusable(path, f"expected format {' | '.join(ENCODINGS)}, got {version[:40]}")
-    return version
-
-
-def _require_up(path: Path, up: str) -> str:
-    if up not in UPS:
-        raise unusable(path, f"expected up={'|'.join(UPS)} in the header, got up={up[:40]}")
-    return up
+def _require_one_of(path: Path, names: Sequence[str], what: str, got: str) -> str:
+    """Return ``got``, the value of ``what`` in a header, if it is one of ``names``."""
+    if got not in names:
+        raise unusable(path, f"expected {what} {' | '.join(names)} in the header, got {got[:40]}")
+    return got
 
 
 def _require_readable(header: PlyHeader, wanted: Mapping[str, Sequence[str]]) -> None:
