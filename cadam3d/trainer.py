@@ -44,7 +44,7 @@ from cadam3d.state import (
 
 @dataclass(frozen=True)
 class Shot:
-    """What a step has rendered."""
+    """The images of a step, and how they were taken."""
 
     cameras: Cameras
     background: Tensor  # one RGB colour per view
@@ -68,7 +68,7 @@ class Losses:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a step has learned before anything moves."""
+    """The findings of a step before anything moves."""
 
     densifier: RowState  # after it has observed the gradients
     loss: float
