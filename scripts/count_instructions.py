@@ -16,8 +16,6 @@ The last column is a slot that hits all pixels of the lanes: the sum of the thre
 pixel of a lane. The numbers are counted in the code, not measured.
 """
 
-import argparse
-import json
 import os
 import re
 import shutil
@@ -27,7 +25,7 @@ import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from measuring import add_base, environment_of, find_trees
+from measuring import add_base, environment_of, find_trees, new_file, parser_of, positive, table, write
 
 INSTALL = "pip install nvidia-cuda-nvrtc nvidia-cuda-nvdisasm"
 # Runs in either checkout: writes the cubin, and prints the log of the assembler.
@@ -78,28 +76,24 @@ class Kernel:
     slots: Slots | None
 
 
-def main() -> None:
-    args = read_arguments()
+def main(words: list[str] | None = None) -> None:
+    """Print the tables."""
+    parser = parser_of(__doc__)
+    add_base(parser)
+    parser.add_argument("--architecture", type=positive, default=90, help="90 is sm_90, a H200 (default: 90)")
+    parser.add_argument("--json", type=new_file, help="also write all numbers to this file")
+    args = parser.parse_args(words)
     nvdisasm = find_nvdisasm()
     if nvdisasm is None:
         raise SystemExit(f"count_instructions: expected nvdisasm, found none. Try: {INSTALL}")
-    trees = find_trees(args.base)
-    counts = {name: count_tree(tree, args.architecture, nvdisasm) for name, tree in trees.items()}
-    if args.json:
-        found = {
-            tree: {name: asdict(each) for name, each in kernels.items()} for tree, kernels in counts.items()
-        }
-        print(json.dumps({"architecture": args.architecture, **found}, indent=2))
-    else:
-        print(as_text(args.architecture, counts))
-
-
-def read_arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    add_base(parser)
-    parser.add_argument("--architecture", type=int, default=90, help="90 is sm_90, a H200 (default: 90)")
-    parser.add_argument("--json", action="store_true", help="print numbers for programs")
-    return parser.parse_args()
+    counts = {
+        name: count_tree(tree, args.architecture, nvdisasm) for name, tree in find_trees(args.base).items()
+    }
+    print(
+        f"sm_{args.architecture}{', base and this checkout' * (args.base is not None)}\n\n{as_text(counts)}"
+    )
+    found = {tree: {name: asdict(each) for name, each in kernels.items()} for tree, kernels in counts.items()}
+    write(args.json, {"architecture": args.architecture, **found})
 
 
 def find_nvdisasm() -> str | None:
@@ -214,44 +208,25 @@ def has_exponential(code: list[Instruction]) -> bool:
     return any(EXPONENTIAL in each.text for each in code)
 
 
-def as_text(architecture: int, counts: dict[str, dict[str, Kernel]]) -> str:
+def as_text(counts: dict[str, dict[str, Kernel]]) -> str:
     """Return two Markdown tables; with a base, each cell has the number before and the number here."""
-    here = counts["here"]
-    lines = [
-        f"sm_{architecture}, base and this checkout" if "base" in counts else f"sm_{architecture}",
-        "",
-        "| kernel | instructions | registers | spilled bytes | shared bytes |",
-        "|---|---|---|---|---|",
-    ]
-    for name, kernel in here.items():
-        before = find_base(counts, name)
-        cells = [
-            both(getattr(before, field) if before else None, getattr(kernel, field))
-            for field in ("instructions", "registers", "spilled", "shared")
-        ]
-        lines.append(f"| `{name}` | {' | '.join(cells)} |")
-    lines += ["", "| instructions of a warp per | slot | sums | pixel | all |", "|---|---|---|---|---|"]
-    for name, kernel in here.items():
-        if kernel.slots is None:
-            continue
-        before = find_base(counts, name)
-        slots = before.slots if before else None
-        cells = [
-            both(getattr(slots, field) if slots else None, getattr(kernel.slots, field))
-            for field in ("slot", "sums", "pixel", "all")
-        ]
-        lines.append(f"| `{name}` | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def find_base(counts: dict[str, dict[str, Kernel]], name: str) -> Kernel | None:
-    """Return the same kernel of the base, which may have tiles of one size only."""
     base = counts.get("base", {})
-    return base.get(name) or base.get(name.removesuffix("_8x8"))
+    kernels, loops = [], []
+    for name, kernel in counts["here"].items():
+        # The base may have tiles of one size only.
+        before = base.get(name) or base.get(name.removesuffix("_8x8"))
+        fields = ("instructions", "registers", "spilled", "shared")
+        kernels.append({"kernel": f"`{name}`"} | {each: both(before, kernel, each) for each in fields})
+        if kernel.slots is not None:
+            slots = before.slots if before else None
+            parts = {each: both(slots, kernel.slots, each) for each in ("slot", "sums", "pixel", "all")}
+            loops.append({"instructions of a warp per": f"`{name}`"} | parts)
+    return f"{table(kernels)}\n\n{table(loops)}"
 
 
-def both(before: float | None, now: float) -> str:
-    return f"{now:g}" if before is None else f"{before:g}, {now:g}"
+def both(before: object, now: object, field: str) -> str:
+    """Return a number of the base, if there is one, and of this checkout."""
+    return ", ".join(f"{getattr(each, field):g}" for each in (before, now) if each is not None)
 
 
 if __name__ == "__main__":

@@ -32,8 +32,7 @@ MACHINE = {
     "nvrtc": "12.8 in libnvrtc.so.12",
     "python": "3.12.3",
     "processor": "A processor",
-    "commit": "0123456789abcdef",
-    "is_changed": True,
+    "commit": "0123456789 with changes",
     "date": "2026-01-02T03:04:05+00:00",
     "tools": {},
     "packages": {"torch": "2.9.0+cu128"},
@@ -427,7 +426,7 @@ def test_the_markdown_has_one_table_with_every_result():
         "200 per step (render 100); peak 3.0 GiB, estimated 3.0",
         "**ended by its time limit**: still running",
         "cuda of gsplat, cuda; auto uses gsplat, **which is slower**",
-        "commit 0123456789 (with changes)",
+        "commit 0123456789 with changes",
     ):
         assert word in text, word
 

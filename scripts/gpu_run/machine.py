@@ -3,9 +3,7 @@
 import ctypes
 import hashlib
 import os
-import platform
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -128,22 +126,6 @@ def find_packages() -> dict[str, str]:
     return found
 
 
-def find_commit() -> tuple[str | None, bool]:
-    """Return the commit and whether files differ from it; ``None`` outside of a checkout."""
-    commit = first_line("git", "-C", str(REPOSITORY), "rev-parse", "HEAD")
-    changed = first_line("git", "-C", str(REPOSITORY), "status", "--porcelain", "--untracked-files=no")
-    return commit, changed is not None
-
-
-def first_line(*command: str) -> str | None:
-    """Return the first line that a command prints; ``None`` if it prints nothing or fails."""
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip().splitlines()[0] if done.stdout.strip() else None
-
-
 def hash_sources(repository: Path = REPOSITORY) -> str:
     """Return a hash of the files that determine the results, also where there is no git."""
     whole = hashlib.sha256()
@@ -152,11 +134,3 @@ def hash_sources(repository: Path = REPOSITORY) -> str:
             if path.suffix in SUFFIXES:
                 whole.update(f"{path.relative_to(repository)}\0".encode() + path.read_bytes())
     return whole.hexdigest()[:16]
-
-
-def processor() -> str:
-    """Return the name of the CPU, as far as the system reports it."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    found = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return found[0] if found else platform.processor() or platform.machine()

@@ -19,8 +19,7 @@ def show(record: Record) -> str:
 def machine(record: Record) -> list[str]:
     """Return the machine in a few words, on lines that fit a page."""
     found = record.machine
-    state = "with changes" if found["is_changed"] else "unchanged"
-    commit = f"commit {found['commit'][:10]} ({state})" if found["commit"] else "no checkout"
+    commit = f"commit {found['commit']}" if found["commit"] else "no checkout"
     packages = ", ".join(f"{name} {number}" for name, number in found["packages"].items())
     tools = ", ".join(found["tools"]) or "none"
     return [

@@ -17,16 +17,15 @@ except ImportError:
     # Windows has no such locks.
     fcntl = None
 
+from measuring import commit, first_line, processor
+
 from gpu_run.machine import (
     REPOSITORY,
     Device,
     TroubleError,
-    find_commit,
     find_packages,
     find_tools,
-    first_line,
     hash_sources,
-    processor,
 )
 from gpu_run.markdown import show, verdicts
 from gpu_run.pieces import CHECKS, PARTS, Setup, plan
@@ -131,7 +130,6 @@ class Session:
         facts = finished.result or {"trouble": says}
         if trouble := facts.pop("trouble", None):
             raise TroubleError(f"{self._device.name}: {trouble}")
-        commit, is_changed = find_commit()
         facts |= {
             "driver": first_line("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"),
             "driver_cuda": self._device.driver_cuda,
@@ -139,8 +137,7 @@ class Session:
             "processor": processor(),
             "python": platform.python_version(),
             "system": platform.platform(),
-            "commit": commit,
-            "is_changed": is_changed,
+            "commit": commit(),
             "date": datetime.now().astimezone().isoformat(timespec="seconds"),
             "tools": find_tools(),
             "packages": packages,
