@@ -147,7 +147,12 @@ def pair_runs(runs: Sequence[StudyRun], *, same_seed: bool) -> list[RunPair]:
             # An arm may have more runs of a prompt than another one; the rest has no partner.
             pairs += [RunPair(both) for both in zip(arms[one], arms[other], strict=False)]
     if not pairs:
-        raise _no_pair(runs, same_seed=same_seed)
+        shared, example = "prompt", "cadam3d sweep --help"
+        if same_seed:
+            shared, example = "prompt and seed", "same_seed=false"
+        raise UserError(
+            f"runs: expected runs of different arms with the same {shared}, got none. Try: {example}"
+        )
     return pairs
 
 
@@ -223,17 +228,3 @@ def _default_labels(
         if all(names) and len(set(names)) == len(names):
             return [name[:LONGEST_LABEL] for name in names]
     return [plain(str(shown(folder)))[-LONGEST_LABEL:] for folder in folders]
-
-
-def _no_pair(runs: Sequence[StudyRun], *, same_seed: bool) -> UserError:
-    """Return the message for arms of which no two share a prompt and a seed."""
-    prompts: dict[str, set[str]] = defaultdict(set)
-    for run in runs:
-        prompts[run.prompt].add(run.arm)
-    if same_seed and any(len(arms) > 1 for arms in prompts.values()):
-        expected, got, example = "the same prompt and seed", "different seeds", "same_seed=false"
-    else:
-        expected, got, example = "the same prompt", "different prompts", "cadam3d sweep --help"
-    return UserError(
-        f"runs: expected runs of different arms with {expected}, got {got} in each arm. Try: {example}"
-    )
