@@ -1,11 +1,9 @@
 """The files that callbacks write into the run folder."""
 
-import pytest
 import torch
 
 from cadam3d.callback.checkpoint import Checkpoint
 from cadam3d.callback.metrics import Metrics
-from cadam3d.core.errors import UserError
 from cadam3d.io.checkpoint import latest_checkpoint, load_checkpoint
 from cadam3d.io.jsonl import append_jsonl, read_jsonl
 from cadam3d.rasterizer.reference import ReferenceRasterizer
@@ -84,16 +82,3 @@ def test_lines_of_steps_that_will_be_repeated_are_deleted(train, tmp_path):
     lines = read_jsonl(tmp_path / "metrics.jsonl")
     assert not any(line.get("old") for line in lines)
     assert [line["step"] for line in lines] == [1, 2]
-
-
-@pytest.mark.parametrize(
-    ("make", "key"),
-    [
-        (lambda: Checkpoint(every=0, keep=1), "callback.checkpoint.every=100"),
-        (lambda: Checkpoint(every=1, keep=0), "callback.checkpoint.keep=2"),
-        (lambda: Metrics(every=0), "callback.metrics.every=10"),
-    ],
-)
-def test_zero_intervals_are_refused(make, key):
-    with pytest.raises(UserError, match=key):
-        make()

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from cadam3d.callback.candidates import OTHERS, SELECTED, Candidates, histogram, marked
+from cadam3d.callback.candidates import OTHERS, SELECTED, histogram, marked
 from cadam3d.core.cameras import turntable
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.image import step_pictures
 from cadam3d.io.jsonl import append_jsonl, read_jsonl
@@ -123,19 +122,3 @@ def test_an_extreme_value_does_not_lengthen_a_histogram():
 def test_without_gaussians_there_are_no_bins():
     line = histogram(torch.empty(0), torch.empty(0, dtype=torch.bool), bins_per_decade=10)
     assert line["counts"] == line["selected"] == []
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("every", 0),
-        ("azimuths_deg", []),
-        ("elevation_deg", 100.0),
-        ("distance", 0.0),
-        ("size", 0),
-        ("bins_per_decade", 0),
-    ],
-)
-def test_impossible_settings_are_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"callback\.candidates\.{key}"):
-        Candidates(**{**CALLBACK, key: value})

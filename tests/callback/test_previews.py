@@ -2,10 +2,7 @@
 
 import imageio.v3 as imageio
 import numpy as np
-import pytest
 
-from cadam3d.callback.previews import Previews
-from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import compose
 
 LINE = ("densifier.min_age=0", "callback=[previews]", "callback.previews.size=16")
@@ -57,20 +54,3 @@ def test_pictures_of_a_killed_run_after_its_checkpoint_are_deleted(train, tmp_pa
     (tmp_path / "previews/step_000099.png").write_bytes(b"old")
     train(tmp_path, *LINE, "callback.previews.every=5")
     assert names(tmp_path) == ["step_000005.png"]
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("every", 0),
-        ("views", 0),
-        ("elevation_deg", 100.0),
-        ("distance", 0.0),
-        ("fov_y_deg", 180.0),
-        ("size", 0),
-        ("background", [2.0, 0.0, 0.0]),
-    ],
-)
-def test_impossible_settings_are_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"callback\.previews\.{key}"):
-        Previews(**{**SETTINGS, key: value})

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from cadam3d.callback.snapshots import Snapshots
-from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import snapshots
 
 TEN = ("steps=10", "densifier.min_age=0")
@@ -60,10 +59,3 @@ def test_a_resumed_run_removes_what_was_recorded_after_its_checkpoint(train, tmp
     train(tmp_path, "steps=4", callbacks=[Snapshots(every=2, largest=1000)])
     assert not stale.exists()
     assert (tmp_path / "snapshots/notes.txt").exists()
-
-
-def test_wrong_values_name_their_key():
-    with pytest.raises(UserError, match=r"callback\.snapshots\.every=50"):
-        Snapshots(every=0, largest=1)
-    with pytest.raises(UserError, match=r"callback\.snapshots\.largest"):
-        Snapshots(every=1, largest=-1)

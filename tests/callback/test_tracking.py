@@ -12,6 +12,7 @@ from composed import as_yaml, composed
 
 from cadam3d.build import components
 from cadam3d.callback import tracking
+from cadam3d.callback.base import Callback
 from cadam3d.callback.previews import Previews
 from cadam3d.callback.tensorboard import TensorBoard
 from cadam3d.callback.tracking import Tracking
@@ -137,7 +138,7 @@ def test_no_run_begins_in_a_folder_with_records_of_another_one(name, tmp_path):
 def test_a_missing_package_names_its_extra(name, monkeypatch):
     monkeypatch.setattr(tracking, "find_spec", lambda _: None)
     with pytest.raises(UserError) as raised:
-        components(composed(f"callback=[{name}]", "prompt=a").callback, key="callback")
+        components(composed(f"callback=[{name}]", "prompt=a").callback, Callback, "callback")
     assert str(raised.value) == (
         f"callback={name}: expected the package {name}, got none. Try: pip install 'cadam3d[{name}]'"
     )

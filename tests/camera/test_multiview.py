@@ -86,19 +86,3 @@ def test_whole_groups_are_accepted():
 def test_results_depend_on_the_generator_alone():
     assert torch.equal(sample(4, seed=1).world_to_camera, sample(4, seed=1).world_to_camera)
     assert not torch.equal(sample(4, seed=1).world_to_camera, sample(4, seed=2).world_to_camera)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("size", 0),
-        ("elevation_deg", [30.0, 0.0]),
-        ("elevation_law", "gaussian"),
-        ("relative_distance", [0.1, 1.0]),  # inside the unit ball at 60 degrees
-        ("relative_distance", [1.0]),
-        ("fov_y_deg", [0.0, 60.0]),
-    ],
-)
-def test_an_impossible_value_is_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"camera\.{key}"):
-        Multiview(**{**PUBLISHED, key: value})

@@ -1,11 +1,9 @@
 """Laws of the sphere sampler."""
 
-import pytest
 import torch
 
 from cadam3d.camera.sphere import Sphere
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.errors import UserError
 
 
 def sample(views: int, seed: int = 0, **changes) -> Cameras:
@@ -43,11 +41,3 @@ def test_angles_agree_with_positions():
 def test_results_depend_on_the_generator_alone():
     assert torch.equal(sample(3, seed=1).world_to_camera, sample(3, seed=1).world_to_camera)
     assert not torch.equal(sample(3, seed=1).world_to_camera, sample(3, seed=2).world_to_camera)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"), [("size", 0), ("distance", [3.0, 2.0]), ("fov_y_deg", [45.0, 175.0])]
-)
-def test_an_impossible_value_is_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"camera\.{key}"):
-        sample(1, **{key: value})

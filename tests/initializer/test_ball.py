@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import SH_C0
 from cadam3d.initializer.ball import Ball
@@ -69,21 +68,3 @@ def test_neighbouring_gaussians_just_overlap_by_default():
 def test_results_depend_on_the_generator_alone():
     assert torch.equal(build(seed=1).means, build(seed=1).means)
     assert not torch.equal(build(seed=1).means, build(seed=2).means)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("count", 0),
-        ("radius", 0.0),
-        ("radius", 1.5),
-        ("scale", 0.0),
-        ("opacity", 1.0),
-        ("sh_degree", 4),
-        ("color", [0.5, 0.5]),
-        ("color_noise", -0.1),
-    ],
-)
-def test_an_impossible_value_is_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"initializer\.{key}"):
-        ball(**{key: value})

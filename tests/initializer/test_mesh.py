@@ -270,12 +270,3 @@ def test_a_file_without_a_surface_is_reported(tmp_path, kind):
         trimesh.Trimesh(line, [[0, 1, 2]], process=False).export(tmp_path / "it.ply")
     with pytest.raises(UserError, match=r"expected a mesh with triangles, got .*, which has no surface"):
         build(tmp_path / "it.ply")
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("up", "x"), ("turn_deg", 45), ("radius", 2.0), ("count", 0), ("opacity", 0.0), ("color", [1.0])],
-)
-def test_an_impossible_value_is_refused_by_name(tmp_path, key, value):
-    with pytest.raises(UserError, match=rf"initializer\.{key}"):
-        build(tmp_path / "box.ply", **{key: value})

@@ -320,12 +320,3 @@ def test_a_group_must_have_one_noise_level(prior):
     t = torch.tensor([0.4, 0.4, 0.5, 0.4])
     with pytest.raises(UserError, match=r"^guidance\.shared_t: expected true"):
         prior.predict(normal(4, 4, 8, 8), t, condition_of(prior, views()), 7.5)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("micro_batch", 1), ("micro_batch", 6), ("rescale", 1.5), ("rescale", -0.1), ("tokenizer", "")],
-)
-def test_wrong_values_are_refused_by_key(prior, key, value):
-    with pytest.raises(UserError, match=rf"^prior\.{key}: expected "):
-        replace(prior, **{key: value})

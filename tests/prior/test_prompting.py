@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from cadam3d.core.cameras import orbit
-from cadam3d.core.errors import UserError
 from cadam3d.prior.prompting import (
     BACK,
     FRONT,
@@ -202,19 +201,3 @@ def test_the_component_along_the_prompt_is_not_repelled():
     along = negative + 3 * (positive - negative)
     guided = guide(negative, positive, along[None], -torch.ones(1, 1).double(), 5.0)
     torch.testing.assert_close(guided, negative + 5 * (positive - negative))
-
-
-@pytest.mark.parametrize(
-    ("make", "key"),
-    [
-        (lambda: Discrete(front_deg=100, back_deg=100, overhead_deg=60), "prompting.back_deg"),
-        (lambda: Discrete(front_deg=-1, back_deg=45, overhead_deg=60), "prompting.front_deg"),
-        (lambda: Compass(below_deg=-91, above_deg=35), "prompting.below_deg"),
-        (lambda: Compass(below_deg=40, above_deg=35), "prompting.above_deg"),
-        (lambda: PerpNeg(curve="other", overhead_deg=None), "prompting.curve"),
-        (lambda: PerpNeg(curve="lucid", overhead_deg=100), "prompting.overhead_deg"),
-    ],
-)
-def test_impossible_values_are_refused_by_key(make, key):
-    with pytest.raises(UserError, match=key):
-        make()

@@ -24,7 +24,7 @@ def refusal(prompt, key="prompt"):
         "sphere red",
         "a star, front right view from above",
         "",
-        " ".join(JOINTS),
+        " ".join(sorted(JOINTS)),
     ],
 )
 def test_known_words_are_accepted_in_any_order(prompt):

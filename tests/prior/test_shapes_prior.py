@@ -279,19 +279,3 @@ def test_unknown_words_are_refused_in_both_prompts() -> None:
         prior().embed("a dragon", "")
     with pytest.raises(UserError, match="'blurry'"):
         prior().embed("a torus", "blurry")
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("spread", -0.1),
-        ("edge_spread", float("nan")),
-        ("model_error", -1.0),
-        ("samples_per_pixel", 0),
-        ("census_size", 1),
-        ("seed", -1),
-    ],
-)
-def test_values_out_of_range_are_refused_by_key(key: str, value: float) -> None:
-    with pytest.raises(UserError, match=f"prior.{key}"):
-        prior(**{key: value})

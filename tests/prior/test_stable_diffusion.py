@@ -270,22 +270,6 @@ def test_a_model_that_is_not_on_disk_is_lacking_and_the_hub_is_not_queried(make,
 
 
 @pytest.mark.parametrize(
-    ("changes", "key"),
-    [
-        ({"size": 100}, "prior.size"),
-        ({"size": 0}, "prior.size"),
-        ({"dtype": "int8"}, "prior.dtype"),
-        ({"micro_batch": 0}, "prior.micro_batch"),
-        ({"text_device": "moon"}, "prior.text_device"),
-        ({"noise_levels": "whole"}, "prior.noise_levels"),
-    ],
-)
-def test_wrong_values_are_named(make, changes, key):
-    with pytest.raises(UserError, match=key):
-        make(**changes)
-
-
-@pytest.mark.parametrize(
     ("changes", "word"),
     [
         ({"beta_schedule": "squaredcos_cap_v2"}, "scaled_linear"),

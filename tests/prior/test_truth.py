@@ -84,9 +84,3 @@ def test_a_prompt_of_another_world_is_refused_in_one_line(prompt, reason):
     with pytest.raises(UserError, match=r"^truth: expected .* Try: truth=prior$") as refused:
         shapes(prompt)
     assert reason in str(refused.value)
-
-
-@pytest.mark.parametrize(("key", "value"), [("samples_per_pixel", 0), ("turns", 1), ("turns", 73)])
-def test_wrong_values_name_their_key(key, value):
-    with pytest.raises(UserError, match=rf"^truth\.{key}: expected a whole number"):
-        shapes(**{key: value})
