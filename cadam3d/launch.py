@@ -29,7 +29,7 @@ from cadam3d.settings.line import (
     split,
     text_of,
 )
-from cadam3d.settings.options import config_dir, with_example
+from cadam3d.settings.options import config_dir
 from cadam3d.settings.target import require_target
 from cadam3d.sweep.plan import require_attempts
 
@@ -101,8 +101,8 @@ def explaining(command: str, words: Sequence[str]) -> Iterator[None]:
     """Translate the exceptions of Hydra and OmegaConf into ``UserError``, here and nowhere else."""
     try:
         yield
-    except UserError as error:
-        raise with_example(error) from error.__cause__
+    except UserError:
+        raise
     except Exception as error:
         reraise_interrupt(error)
         advice = explain(error, command, words)

@@ -15,7 +15,8 @@ STILL = {"position_jitter": 0.0, "target_jitter": 0.0, "up_jitter": 0.0}
 
 
 def published(*lines: str) -> Progressive:
-    return component(compose(["prompt=a red cube", "camera=progressive", "steps=5000", *lines]).camera)
+    cfg = compose(["prompt=a red cube", "camera=progressive", "steps=5000", *lines])
+    return component(cfg.camera, key="camera")
 
 
 def changed(sampler: Progressive, **changes) -> Progressive:

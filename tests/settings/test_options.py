@@ -66,7 +66,6 @@ def test_an_option_of_another_folder_comes_before_that_of_the_package(tmp_path):
         ("densifier.tau_Q", "densifier.tau_Q=0.9"),
         ("densifier.cap", "densifier.cap=20000"),
         ("exporter.mesh.format", "exporter.mesh.format=glb"),
-        ("initializer.fallback.count", "initializer.fallback.count=4000"),
         ("optimizer.means_lr.steps", "optimizer.means_lr.steps=600"),
         ("optimizer.means_lr", "optimizer=adam"),
         ("prompt", "'prompt=a red torus'"),
