@@ -1,7 +1,6 @@
 """``cadam3d train attempts=N``: which attempt is chosen, and why; a small program replaces training."""
 
 import json
-import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -109,8 +108,8 @@ def attempt_configs(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("configs")
     for name in ("hydra", "metric", "launcher"):
         shutil.copytree(REPOSITORY / "configs" / name, folder / name)
-    for name in ("sweep.yaml", "jobs.yaml"):
-        shutil.copy(REPOSITORY / "configs" / name, folder)
+    for path in (REPOSITORY / "configs").glob("*.yaml"):
+        shutil.copy(path, folder)
     (folder / "grid").mkdir()
     (folder / "experiment").mkdir()
     (folder / "experiment" / "three.yaml").write_text("# @package _global_\nattempts: 3\n", encoding="utf-8")
@@ -269,7 +268,7 @@ def test_resuming_the_folder_of_attempts_is_refused_with_the_line_that_continues
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["attempts=0"], "attempts: expected a whole number >= 1 and <= 1000, got 0. Try: attempts=4"),
+        (["attempts=0"], "attempts: expected a whole number >= 1 and <= 1000, got 0."),
         (["attempts=two"], "attempts: expected a whole number"),
         (["attempts=2", "select=psnrr"], "Try: select=psnr"),
         (["attempts=2", "select=turn_deg"], "select: expected one of "),
@@ -318,13 +317,6 @@ def test_without_links_the_best_is_a_copy_and_an_earlier_copy_is_kept(tmp_path, 
     link_best(tmp_path, "seed=1")
     assert json.loads((tmp_path / "best" / "summary.json").read_text()) == {"seed": 1}
     assert (tmp_path / "best-2" / "mine.txt").exists()
-
-
-@pytest.mark.parametrize("word", ["seed=0,1", "prompts=paper50", "grid=paper"])
-def test_the_line_of_a_sweep_that_is_suggested_has_no_attempts(word, train):
-    code, _, err = train(*LINE, "select=psnr", word)
-    line = shlex.join(["cadam3d", "sweep", "prompt=an attempt", word])
-    assert (code, err.endswith(f"Try: {line}\n")) == (1, True), err
 
 
 def test_attempts_that_are_trusted_have_the_folder_that_they_had(train):
