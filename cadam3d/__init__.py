@@ -14,7 +14,7 @@ _HOMES = {
     "Asset": "cadam3d.api.asset",
     "Callback": "cadam3d.callback.base",
     "Run": "cadam3d.api.training",
-    "Trainer": "cadam3d.api.stepping",
+    "Stepper": "cadam3d.api.stepping",
     "UserError": "cadam3d.core.errors",
     "compose": "cadam3d.api.stepping",
     "load": "cadam3d.api.asset",

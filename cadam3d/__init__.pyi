@@ -1,6 +1,6 @@
 from cadam3d.api.asset import Asset as Asset
 from cadam3d.api.asset import load as load
-from cadam3d.api.stepping import Trainer as Trainer
+from cadam3d.api.stepping import Stepper as Stepper
 from cadam3d.api.stepping import compose as compose
 from cadam3d.api.training import Run as Run
 from cadam3d.api.training import train as train

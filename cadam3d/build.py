@@ -123,7 +123,7 @@ def component(node: Any, kind: type = object, key: str = CONFIGURATION) -> Any:
         raise _unreadable(error, key) from error
 
 
-def components(group: Any, kind: type, key: str) -> dict[str, Any]:
+def components(group: Any, kind: type = object, key: str = CONFIGURATION) -> dict[str, Any]:
     """Build every chosen member of a group of which several can be chosen, by name.
 
     An experiment may tune a member that the line has not chosen; such a node has keys but no ``_target_``.

@@ -24,8 +24,6 @@ COMMANDS = {  # the purpose of each, and a line to paste
     "study": ("let people compare runs, and evaluate it", "cadam3d study runs=multirun/thresholds"),
     "doctor": ("check this machine, with a hint per failure", "cadam3d doctor"),
 }
-# The command for a line that begins with one of these settings; all other settings are of training.
-COMMAND_OF = {"run": "view", "ply": "view", "grid": "sweep", "runs": "study", "answers": "study"}
 HELP_FLAGS = ("--help", "-h", "help")
 COMPLETION_FLAGS = ("--shell-completion", "-sc")
 
@@ -93,24 +91,18 @@ def help_text() -> str:
 
 
 def unknown_command(words: Sequence[str]) -> UserError:
-    """Return the error for an unknown command; for a sentence or an override it shows the right line."""
+    """Return the error for an unknown command, with the nearest one or with the line for a bare prompt."""
     from cadam3d.settings.advice import did_you_mean
 
-    first = words[0]
-    listed = "|".join(COMMANDS)
-    sentence = [word for word in words if "=" not in word and not word.startswith("-")]
-    if "=" in first:
-        command = COMMAND_OF.get(first.partition("=")[0], "train")
-        line = shlex.join(["cadam3d", command, *words])
-    elif near := did_you_mean(first, list(COMMANDS)):
+    first, near = words[0], did_you_mean(words[0], list(COMMANDS))
+    if near:
         line = shlex.join(["cadam3d", near[0], *words[1:]])
         return UserError(f"{first!r} is not a command. Did you mean {near[0]}? Try: {line}")
-    elif not first.startswith("-") and " " in " ".join(sentence):
-        others = [word for word in words if word not in sentence]
-        line = shlex.join(["cadam3d", "train", f"prompt={' '.join(sentence)}", *others])
-    else:
-        line = "cadam3d --help"
-    return UserError(f"{first!r} is not a command: expected one of {listed}. Try: {line}")
+    prompt = " ".join(word for word in words if "=" not in word)
+    settings = [word for word in words if "=" in word]
+    line = shlex.join(["cadam3d", "train", *([f"prompt={prompt}"] if prompt else []), *settings])
+    line = "cadam3d --help" if first.startswith("-") else line
+    return UserError(f"{first!r} is not a command: expected one of {'|'.join(COMMANDS)}. Try: {line}")
 
 
 def complete(words: Sequence[str]) -> int:

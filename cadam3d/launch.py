@@ -29,8 +29,7 @@ from cadam3d.settings.line import (
     split,
     text_of,
 )
-from cadam3d.settings.options import config_dir
-from cadam3d.settings.target import require_target
+from cadam3d.settings.options import config_dir, with_example
 from cadam3d.sweep.plan import require_attempts
 
 TRAINING = ("train", "sweep")  # the commands that have a run folder
@@ -225,8 +224,6 @@ def _refuse_words(line: Line) -> None:
     if line.is_sweep and command not in TRAINING:
         kept = [override for override in line.words if override != "hydra.mode=MULTIRUN"]
         raise UserError(f"{command}: only training can be swept. Try: {line_of(command, kept)}")
-    if command == "export":
-        require_target(line.words)
 
 
 def _bare_word(line: Line, word: str) -> UserError:

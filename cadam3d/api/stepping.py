@@ -10,7 +10,6 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from cadam3d import trainer as loop
 from cadam3d.api.asset import Asset
 from cadam3d.api.guest import as_guest, logging_messages, require_object, require_words, usual_modes
 from cadam3d.augmentation import Augmentation
@@ -33,6 +32,7 @@ from cadam3d.prior.base import DiffusionPrior, PromptEmbedding
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.settings.line import key_of
 from cadam3d.state import RefineReport, StepReport, TrainState
+from cadam3d.trainer import Trainer
 
 # What an object may replace, and the class of the object.
 REPLACEABLE: Mapping[str, type] = {
@@ -62,7 +62,7 @@ class Step(StepReport):
 
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
-class Trainer:
+class Stepper:
     """A run that the caller steps by hand. It does not change; the state that :meth:`start` returns does.
 
     Nothing is written, and the callbacks, exporters and metrics of the settings are not used. The bytes of
@@ -75,7 +75,7 @@ class Trainer:
     device: torch.device
     config: dict[str, Any]  # all settings, resolved
     initializer: Initializer  # makes the Gaussians of the start
-    parts: loop.Trainer  # the other components: parts.densifier, parts.guidance, parts.prior and so on
+    parts: Trainer  # the other components: parts.densifier, parts.guidance, parts.prior and so on
 
     @property
     def steps(self) -> int:
@@ -130,7 +130,7 @@ class Trainer:
         parts = self.parts
         names = [type(part).__name__ for part in (parts.densifier, parts.guidance, parts.prior)]
         facts = [f"{self.steps} steps of {parts.views} views", *names, f"seed {self.seed}"]
-        return f"<Trainer {self.prompt!r}: {', '.join(facts)}, on {self.device}>"
+        return f"<Stepper {self.prompt!r}: {', '.join(facts)}, on {self.device}>"
 
 
 def compose(  # noqa: PLR0913  (one argument per component)
@@ -146,7 +146,7 @@ def compose(  # noqa: PLR0913  (one argument per component)
     prior: DiffusionPrior | None = None,
     rasterizer: Rasterizer | None = None,
     refine: Refine | None = None,
-) -> Trainer:
+) -> Stepper:
     """Return a trainer with the settings of ``cadam3d train OVERRIDES``, to be stepped by hand.
 
     ``overrides`` are the words of the command line, without quotes for a shell; one of them must be the
@@ -179,7 +179,7 @@ def compose(  # noqa: PLR0913  (one argument per component)
         trainer = build_trainer(cfg, device, given)
         if initializer is None:
             initializer = component(cfg.initializer, Initializer, "initializer")
-        return Trainer(
+        return Stepper(
             prompt=cfg.prompt,
             negative_prompt=cfg.negative_prompt,
             seed=cfg.seed,

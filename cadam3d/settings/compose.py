@@ -1,9 +1,7 @@
 """Compose: read the YAML files and apply the overrides of a command line, as Hydra does."""
 
-import difflib
 import math
 import re
-import shlex
 import unicodedata
 from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
@@ -135,18 +133,11 @@ def require_files(folder: Path, flag: str) -> None:
     Reading a named pipe would never end. Only the folders of groups are searched.
     """
     if not folder.is_dir():
-        raise UserError(f"{flag}: expected a folder, got {str(folder)!r}. Try: {_folder_like(flag, folder)}")
+        raise UserError(f"{flag}: expected a folder, got {str(folder)!r}. Try: {flag}=.")
     groups = [path.relative_to(config_dir()) for path in config_dir().rglob("*") if path.is_dir()]
     for path in [path for group in (Path(), *groups) for path in (folder / group).glob("*.yaml")]:
         if path.exists() and not path.is_file() and not path.is_dir():
             raise UserError(f"{flag}: {path} is not a regular file. Try: cadam3d train --help")
-
-
-def _folder_like(flag: str, missing: Path) -> str:
-    """Return the flag for the folder whose name is nearest to ``missing``, or for the current folder."""
-    beside = sorted(place.name for place in missing.parent.glob("*/") if place.is_dir())
-    near = difflib.get_close_matches(missing.name, beside, n=1)
-    return shlex.quote(f"{flag}={missing.with_name(near[0]) if near else '.'}")
 
 
 def load_config(path: Path) -> DictConfig:

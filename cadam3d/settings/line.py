@@ -75,13 +75,9 @@ class Line:
     @property
     def wants_page(self) -> bool:
         """Return whether the line asks for a page, and not for work."""
-        return bool(self.wants_page_of_hydra or self.options.help or self.options.cfg)
-
-    @property
-    def wants_page_of_hydra(self) -> bool:
-        """Return whether the line asks for one of the pages about Hydra itself."""
         options = self.options
-        return bool(options.hydra_help or options.info or options.shell_completion)
+        pages = (options.help, options.cfg, options.hydra_help, options.info, options.shell_completion)
+        return any(pages)
 
 
 class _Flags(argparse.ArgumentParser):
@@ -89,21 +85,10 @@ class _Flags(argparse.ArgumentParser):
 
     def __init__(self) -> None:
         super().__init__(add_help=False, allow_abbrev=False)
-        for names in (
-            ("--help", "-h"),
-            ("--hydra-help",),
-            ("--multirun", "-m"),
-            ("--resolve",),
-            ("--shell-completion", "-sc"),
-        ):
-            self.add_argument(*names, action="store_true")
-        for names in (
-            ("--package", "-p"),
-            ("--config-path", "-cp"),
-            ("--config-name", "-cn"),
-            ("--config-dir", "-cd"),
-        ):
-            self.add_argument(*names)
+        for names in ("--help -h", "--hydra-help", "--multirun -m", "--resolve", "--shell-completion -sc"):
+            self.add_argument(*names.split(), action="store_true")
+        for names in ("--package -p", "--config-path -cp", "--config-name -cn", "--config-dir -cd"):
+            self.add_argument(*names.split())
         self.add_argument("--cfg", "-c", choices=("job", "hydra", "all"))
         pages = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
         self.add_argument("--info", "-i", nargs="?", const="all", choices=pages)

@@ -1,12 +1,15 @@
 """Output: which exporter writes the file that ``output=NAME.SUFFIX`` names."""
 
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from cadam3d.core.checks import fail
+from cadam3d.core.errors import UserError
 from cadam3d.exporter.base import Exporter, exporters_by_suffix
+from cadam3d.exporter.programs import PROGRAMS, UNKNOWN
 from cadam3d.io.run_folder import expanded, setting_word
 from cadam3d.settings.line import is_list, key_of, text_of
 from cadam3d.settings.options import option_class, option_names
@@ -26,6 +29,8 @@ def exporting(overrides: Sequence[str], folders: Sequence[Path] = ()) -> list[st
     given = {key_of(override): override for override in overrides}
     name = text_of(given["output"]) if "output" in given else ""
     named = {key.split(".")[1] for key in given if key.startswith("exporter.")}
+    if "for" in given:
+        _require_target(text_of(given["for"]), is_alone="exporter" not in given)
     if "for" in given or not names_file(name):
         is_comparison = is_list(given.get("run", "")) and "exporter" not in given and named <= set(COMPARING)
         return [*overrides, *([f"exporter=[{','.join(COMPARING)}]"] if is_comparison else [])]
@@ -75,3 +80,19 @@ def _options(override: str) -> set[str]:
     """Return the options that an override chooses."""
     value = OverridesParser.create().parse_override(override).value()
     return set(map(str, value)) if isinstance(value, list) else {str(value)}
+
+
+def _require_target(target: str, *, is_alone: bool) -> None:
+    """Raise ``UserError`` for a program with unknown axes, or if the line also names an exporter.
+
+    A program decides which exporter is right. A setting of that exporter, such as ``exporter.glb.up=-y``, is
+    a deliberate change and stays.
+    """
+    if target in UNKNOWN:
+        known = "|".join(sorted(program.target for program in PROGRAMS))
+        expected = f"a program whose axes are known ({known})"
+        got, example = f"{target}: {UNKNOWN[target].reason}", shlex.join(UNKNOWN[target].words)
+        raise UserError(f"for: expected {expected}, got {got}. Try: {example}")
+    if not is_alone:
+        expected = f"for={target} alone, which chooses the exporter"
+        raise UserError(f"exporter: expected {expected}, got both. Try: for={target}")

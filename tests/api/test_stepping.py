@@ -47,7 +47,7 @@ def same(left, right) -> bool:
 
 
 @pytest.fixture(scope="module")
-def trainer() -> cadam3d.Trainer:
+def trainer() -> cadam3d.Stepper:
     return cadam3d.compose(*SMALL, *CADAM)
 
 
