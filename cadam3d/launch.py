@@ -62,13 +62,8 @@ def launch(command: str, words: Sequence[str]) -> int:
     # Imported modules stay in memory, so the garbage collector need not scan them.
     gc.freeze()
     gc.enable()
-    # An exception of the running command is a bug and keeps its traceback, unless it refuses a path.
-    try:
+    with completing(words):
         return module.run(cfg, call) or 0
-    except OSError as error:
-        if advice := refused_path(error, words):
-            raise advice from error
-        raise
 
 
 def prepare(command: str, words: Sequence[str]) -> tuple[DictConfig, Call]:
@@ -96,10 +91,24 @@ def prepare(command: str, words: Sequence[str]) -> tuple[DictConfig, Call]:
 
 
 @contextmanager
+def completing(words: Sequence[str]) -> Iterator[None]:
+    """Add an example to a mistake of the user that a running command finds; a bug keeps its traceback."""
+    try:
+        yield
+    except UserError as error:
+        raise with_example(error) from error.__cause__
+    except OSError as error:
+        if advice := refused_path(error, words):
+            raise advice from error
+        raise
+
+
+@contextmanager
 def explaining(command: str, words: Sequence[str]) -> Iterator[None]:
     """Translate the exceptions of Hydra and OmegaConf into ``UserError``, here and nowhere else."""
     try:
-        yield
+        with completing(words):
+            yield
     except UserError:
         raise
     except Exception as error:

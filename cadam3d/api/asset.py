@@ -46,7 +46,7 @@ from cadam3d.io.asset_record import facts_of
 from cadam3d.io.atomic import replacing
 from cadam3d.io.image import to_uint8
 from cadam3d.io.run_folder import expanded, shown
-from cadam3d.launch import prepare
+from cadam3d.launch import completing, prepare
 from cadam3d.rasterizer.base import Rasterizer, render_fn
 from cadam3d.viewer.pack import pack
 from cadam3d.viewer.page import viewer_page
@@ -212,7 +212,7 @@ class Asset:
         place = path_text("output", path, 'export("asset.ply")')
         require_free(overrides, {"output": place, "run": self, "ply": self})
         words = [literal("output", place), *overrides]
-        with as_guest():
+        with as_guest(), completing(words):
             cfg, _ = prepare("export", words)
             source = self.source or Path("asset")
             set_title(cfg, self.title)

@@ -26,7 +26,7 @@ from cadam3d.densifier.refine import Refine
 from cadam3d.exposure import Exposure
 from cadam3d.guidance.base import Guidance
 from cadam3d.initializer.base import Initializer
-from cadam3d.launch import prepare
+from cadam3d.launch import completing, prepare
 from cadam3d.optimizer import AdamSettings
 from cadam3d.prior.base import DiffusionPrior, PromptEmbedding
 from cadam3d.rasterizer.base import Rasterizer
@@ -172,7 +172,7 @@ def compose(  # noqa: PLR0913  (one argument per component)
             raise UserError(
                 'resume: only a whole run continues another. Try: cadam3d.train(None, "resume=RUN")'
             )
-    with as_guest():
+    with as_guest(), completing(overrides):
         cfg, _ = prepare("train", overrides)
         device = resolve_device(cfg.device)
         require_whole("seed", cfg.seed, low=0)

@@ -23,7 +23,7 @@ from cadam3d.commands.opened import find_run
 from cadam3d.commands.train import optimise
 from cadam3d.io.records import psnr_of, read_config, read_metrics, read_summary
 from cadam3d.io.run_folder import CONFIG, REPORT, RUN_FOLDER, shown
-from cadam3d.launch import prepare
+from cadam3d.launch import completing, prepare
 
 
 class Run:
@@ -110,7 +110,7 @@ def train(
     for callback in callbacks:
         require_object("callbacks", callback, Callback, "callbacks=[]")
     stop = StopOnSignal(_signals())
-    with as_guest():
+    with as_guest(), completing(words):
         cfg, call = prepare("train", words)
         folder, _ = optimise(cfg, call, stop, callbacks)
     run = Run(folder)
