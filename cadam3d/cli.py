@@ -43,9 +43,7 @@ def main() -> None:
     except UserError as error:
         if wants_traceback:
             raise
-        from cadam3d.settings.options import with_example
-
-        print(f"cadam3d: {with_example(error)}", file=sys.stderr)
+        print(f"cadam3d: {error}", file=sys.stderr)
         code = 1
     except KeyboardInterrupt:
         print("\ncadam3d: interrupted", file=sys.stderr)
