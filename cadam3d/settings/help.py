@@ -93,8 +93,8 @@ class Library:
         groups = {name: group for base in bases for name, group in self.groups(base).items()}
         choices.pop("hydra", None)
         for name in choices:
-            chosen, is_list = choices[name] or [], isinstance(choices[name], list)
-            chosen = tuple(chosen if is_list or not chosen else [chosen])
+            value, is_list = choices[name], isinstance(choices[name], list)
+            chosen = tuple(map(str, value if is_list else [] if value is None else [value]))
             groups[name] = Choices(name=name, chosen=chosen, is_list=is_list, words=words[name])
         return groups
 
