@@ -10,7 +10,7 @@ from torch import Tensor
 from cadam3d.core.checks import require_range
 from cadam3d.core.device import upload
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 
 # The smallest factor that noise multiplies a scale by. It is positive, so its logarithm is finite.
 LEAST = 1e-3

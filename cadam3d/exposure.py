@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.checks import require, require_range, require_whole
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 
 
 class Exposure(ABC):

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from cadam3d.core.checks import require_range
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 
 # Distance of alpha from 0 and 1 that keeps logarithms finite in transparent and in opaque pixels.

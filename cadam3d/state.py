@@ -14,7 +14,7 @@ from cadam3d.core.checks import require
 from cadam3d.core.edit import RowEdit, RowState
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.outcome import Outcome
-from cadam3d.core.render import RenderFn
+from cadam3d.core.rendering import RenderFn
 from cadam3d.core.sh import MAX_DEGREE
 from cadam3d.densifier.base import Densifier
 from cadam3d.optimizer import MOMENTS, AdamSettings, GaussianOptimizer, parts_of

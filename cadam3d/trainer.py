@@ -21,7 +21,7 @@ from cadam3d.core.device import upload_together
 from cadam3d.core.edit import RowState
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import is_out_of_memory
-from cadam3d.core.render import RenderFn, RenderOutput
+from cadam3d.core.rendering import RenderFn, RenderOutput
 from cadam3d.densifier.base import Densifier, GradientSignal
 from cadam3d.densifier.refine import Refine, RefinePlan
 from cadam3d.exposure import Exposure

@@ -135,7 +135,7 @@ def read_arguments() -> argparse.Namespace:
 def compile_stub(folder: Path) -> Path:
     # The script also runs where another cadam3d is installed, or none.
     sys.path.insert(0, str(HERE))
-    from cadam3d.compiled.build import find_compiler
+    from cadam3d.compiled.library import find_compiler
 
     compiler = find_compiler()
     if compiler is None:

@@ -19,7 +19,7 @@ from torch import Tensor
 from cadam3d.build import component
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.mesh import mesh_facts
 from cadam3d.io.ply import read_ply

@@ -23,7 +23,7 @@ from cadam3d.callback.base import Callback
 from cadam3d.commands.beginning import run_context
 from cadam3d.core.cameras import orbit
 from cadam3d.core.palette import INK, LINE, PAPER, SOFT
-from cadam3d.core.render import RenderFn
+from cadam3d.core.rendering import RenderFn
 from cadam3d.io.atomic import replacing
 from cadam3d.io.caption import BOLD, REGULAR, font
 from cadam3d.io.image import to_uint8

@@ -17,11 +17,11 @@ import pytest
 import torch
 from filelock import FileLock
 
-from cadam3d.compiled.build import find_compiler
+from cadam3d.compiled.library import find_compiler
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.rasterizer import cuda, workspace
 from cadam3d.rasterizer.base import KERNELS, definitions
 from cadam3d.rasterizer.cuda import rasterize

@@ -14,7 +14,7 @@ import torch
 
 from cadam3d.core.cameras import Cameras, orbit
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.rasterizer.base import ALPHA_MAX, ALPHA_MIN, BLUR, FRUSTUM_MARGIN, NEAR, TRANSMITTANCE_MIN
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 

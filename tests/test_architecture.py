@@ -374,6 +374,22 @@ def test_a_draw_from_an_explicit_generator_is_allowed(line):
     assert not global_draws(line)
 
 
+def test_no_class_is_defined_twice():
+    places: dict[str, list[str]] = {}
+    for path in sources():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(str(path.relative_to(PACKAGE)))
+    assert not {name: where for name, where in places.items() if len(where) > 1}
+
+
+def test_outside_of_components_no_file_name_exists_twice():
+    """``exporter=mesh`` and ``metric=mesh`` are rightly called so; other files have names of their own."""
+    groups = {path.name for path in (PACKAGE.parent / "configs").iterdir() if path.is_dir()}
+    names = [path.name for path in sources() if part_of(path) not in groups and path.name != "__init__.py"]
+    assert not {name for name in names if names.count(name) > 1}
+
+
 def test_nothing_is_imported_by_star():
     assert not [path for path in sources() for _, names in imports(path) if "*" in names]
 

@@ -6,7 +6,7 @@ from splats import make_gaussians
 
 from cadam3d.augmentation import LucidAugmentation
 from cadam3d.core.errors import UserError
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 
 
 def draw(seed: int = 0) -> torch.Generator:

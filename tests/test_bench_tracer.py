@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from cadam3d.compiled.build import find_compiler
+from cadam3d.compiled.library import find_compiler
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 import bench_tracer

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.exposure import BrightnessGuard, NoExposure
 
 PUBLISHED = {"begin": 1000, "end": 4500, "quantile": 0.85, "threshold": 0.9, "rate": 0.8}

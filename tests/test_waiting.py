@@ -17,7 +17,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from cadam3d.build import build_trainer, component
 from cadam3d.core.device import read_numbers, upload_together
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.densifier.baseline import Baseline
 from cadam3d.exposure import NoExposure
 from cadam3d.prior.mvdream import CHECKED
@@ -84,7 +84,7 @@ def step_without_values(monkeypatch, lines: Sequence[str]) -> tuple[int, list[bo
         # It has not overflowed, nothing is dimmed, and all gradients are finite.
         return [0.0, *[1.0] * (len(numbers) - 1)]
 
-    monkeypatch.setattr("cadam3d.core.render.read_numbers", read)
+    monkeypatch.setattr("cadam3d.core.rendering.read_numbers", read)
     with Transfers() as transfers:
         trainer.step(state, embedding)
     assert (state.step, state.skipped, state.dimmed) == (1, 0, 0)

@@ -36,7 +36,7 @@ from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.mesh.surface import SurfaceSettings
-from cadam3d.core.render import RenderFn, RenderOutput, Subject
+from cadam3d.core.rendering import RenderFn, RenderOutput, Subject
 from cadam3d.exporter.html import UNTITLED, HtmlExporter
 from cadam3d.exporter.images import ImagesExporter
 from cadam3d.exporter.mesh import MeshExporter

@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 import torch
 
 from cadam3d.commands.finding import Finding, Verdict, attempt
-from cadam3d.compiled import build
+from cadam3d.compiled import library
 from cadam3d.core.cameras import turntable
 from cadam3d.core.errors import UserError
 from cadam3d.io.cache import kernels_dir
@@ -68,8 +68,8 @@ def _compiled(
 
 
 def _cpu_kernels() -> Finding:
-    built = build.build(cpu_library(), kernels_dir(None))
-    found, facts = _native(instruction_set(build.load(built)), built)
+    built = library.build(cpu_library(), kernels_dir(None))
+    found, facts = _native(instruction_set(library.load(built)), built)
     return Finding("kernels for cpu", Verdict.OK, found, facts=facts)
 
 
@@ -178,20 +178,20 @@ def _tracer() -> Finding:
     return Finding(TRACER, Verdict.BROKEN, f"native, {how}; differs by {difference:.1g}", hint, facts)
 
 
-def _native(instructions: str, built: build.Build) -> tuple[str, dict[str, object]]:
+def _native(instructions: str, built: library.Build) -> tuple[str, dict[str, object]]:
     """Return how kernels for the CPU were compiled, in words and as JSON values."""
-    compiler = build.find_compiler()
+    compiler = library.find_compiler()
     version = compiler.version if compiler else None
     facts = {"compiler": version, "instruction_set": instructions, **kept(built)}
     return f"{instructions} by {version or 'a compiler that was removed'}, {when(built)}", facts
 
 
-def kept(built: build.Build | nvrtc.Cubin) -> dict[str, object]:
+def kept(built: library.Build | nvrtc.Cubin) -> dict[str, object]:
     """Return where a compiled file is and whether it was compiled now, as JSON values."""
     return {"path": str(built.path), "compiled_now": built.seconds > 0, "compile_seconds": built.seconds}
 
 
-def when(built: build.Build | nvrtc.Cubin) -> str:
+def when(built: library.Build | nvrtc.Cubin) -> str:
     """Return where a compiled file is and whether it was compiled now, in words."""
     how = f"compiled now in {built.seconds:.1f} s, kept in" if built.seconds else "from the cache in"
     return f"{how} {built.path.parent}"

@@ -14,7 +14,7 @@ from cadam3d.build import component, components
 from cadam3d.commands.measuring import build_metrics, measure
 from cadam3d.commands.writing import run_exporters
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import Truth
+from cadam3d.core.rendering import Truth
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.records import psnr_of

@@ -16,7 +16,7 @@ from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.outcome import Outcome
-from cadam3d.core.render import RenderFn, RenderOutput
+from cadam3d.core.rendering import RenderFn, RenderOutput
 from cadam3d.io.asset_file import read_gaussians
 from cadam3d.io.frames import UPS
 from cadam3d.io.records import read_summary

@@ -11,7 +11,7 @@ from cadam3d.commands.opened import find_run, open_asset, open_run, renderer
 from cadam3d.commands.writing import Output, chosen_exporters, run_exporters, write_files
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
-from cadam3d.core.render import Subject
+from cadam3d.core.rendering import Subject
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.caption import plain
 from cadam3d.io.records import read_summary

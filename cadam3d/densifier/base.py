@@ -12,7 +12,7 @@ from cadam3d.core.chart import Chart
 from cadam3d.core.checks import require
 from cadam3d.core.edit import RowEdit, RowState
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.densifier.refine import Refine, RefinePlan
 
 State = TypeVar("State", bound=RowState)

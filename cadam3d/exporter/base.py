@@ -9,7 +9,7 @@ from typing import ClassVar
 from cadam3d.core.checks import require_choice
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderFn, Subject
+from cadam3d.core.rendering import RenderFn, Subject
 from cadam3d.io.frames import UPS
 
 

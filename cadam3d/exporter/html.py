@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from cadam3d.core.checks import require_color, require_range
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderFn
+from cadam3d.core.rendering import RenderFn
 from cadam3d.exporter.base import Contents, Exporter, gaussians_in
 from cadam3d.io.atomic import replacing
 from cadam3d.viewer.pack import pack

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from cadam3d.core.checks import require
 from cadam3d.core.pictures import CutoutSettings
-from cadam3d.core.render import Subject
+from cadam3d.core.rendering import Subject
 from cadam3d.exporter.pictures import KINDS, PictureExporter, captions_of, paint, paper_of
 from cadam3d.io.atomic import replacing_series
 from cadam3d.io.caption import side_by_side

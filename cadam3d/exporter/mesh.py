@@ -9,7 +9,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import require_memory
 from cadam3d.core.mesh.surface import SurfaceSettings
-from cadam3d.core.render import RenderFn
+from cadam3d.core.rendering import RenderFn
 from cadam3d.exporter.base import Contents, Exporter
 from cadam3d.io.atlas import paint, require_xatlas
 from cadam3d.io.frames import UPS

@@ -11,7 +11,7 @@ from torch import Tensor
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.mesh.normals import unit_normals, with_normals
-from cadam3d.core.render import RenderFn, Subject
+from cadam3d.core.rendering import RenderFn, Subject
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.caption import PAPER, Caption, Color
 from cadam3d.io.image import closeness, cutout

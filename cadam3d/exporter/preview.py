@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 
 from cadam3d.core.checks import require_choice
 from cadam3d.core.pictures import PictureSettings
-from cadam3d.core.render import Subject
+from cadam3d.core.rendering import Subject
 from cadam3d.exporter.pictures import PictureExporter, captions_of, paper_of
 from cadam3d.io.caption import side_by_side
 from cadam3d.io.image import contact_sheet, to_uint8, write_png_bytes

@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from cadam3d.core.checks import require_choice, require_range, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderFn
+from cadam3d.core.rendering import RenderFn
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.caption import Caption, side_by_side
 from cadam3d.io.image import read_png, step_pictures

@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import fail, require, require_choice, require_range, require_whole
 from cadam3d.core.pictures import CutoutSettings
-from cadam3d.core.render import Subject
+from cadam3d.core.rendering import Subject
 from cadam3d.exporter.pictures import PictureExporter, captions_of, paint, paper_of
 from cadam3d.io.caption import side_by_side
 from cadam3d.io.image import to_uint8

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.number import Number
-from cadam3d.core.render import RenderFn, Truth
+from cadam3d.core.rendering import RenderFn, Truth
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cadam3d.core.checks import require_whole
 from cadam3d.core.number import Number
-from cadam3d.core.render import RenderFn, Truth
+from cadam3d.core.rendering import RenderFn, Truth
 from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.held_out import HeldOutSettings
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cadam3d.core.number import Number
-from cadam3d.core.render import RenderFn, Truth
+from cadam3d.core.rendering import RenderFn, Truth
 from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.held_out import HeldOutSettings
 

@@ -19,7 +19,7 @@ from torch.nn.functional import interpolate
 from cadam3d.core.cameras import Cameras, orbit
 from cadam3d.core.checks import require, require_choice, require_whole
 from cadam3d.core.pictures import PictureSettings
-from cadam3d.core.render import RenderFn, RenderOutput
+from cadam3d.core.rendering import RenderFn, RenderOutput
 
 # Views that are rendered and scored at once, which bounds the memory.
 VIEWS_AT_ONCE = 4

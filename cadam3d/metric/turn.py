@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, fitting_distance, orbit
-from cadam3d.core.render import RenderFn, Truth
+from cadam3d.core.rendering import RenderFn, Truth
 
 SIZE = 64  # pixels per side
 ELEVATIONS_DEG = (-10.0, 20.0, 50.0)

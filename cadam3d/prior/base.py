@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.render import Truth
+from cadam3d.core.rendering import Truth
 from cadam3d.prior.path import NoisePath, Prediction
 
 

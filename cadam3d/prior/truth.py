@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from cadam3d.core.checks import require_choice, require_whole
 from cadam3d.core.errors import UserError
-from cadam3d.core.render import Truth
+from cadam3d.core.rendering import Truth
 from cadam3d.prior.base import DiffusionPrior
 from cadam3d.prior.shapes.prior import true_scene
 from cadam3d.prior.shapes.scene import build

@@ -11,7 +11,7 @@ from torch import Tensor
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.rasterizer.cpu import CpuRasterizer
 from cadam3d.rasterizer.cuda import CudaRasterizer

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import OverflowedError, RenderFn, RenderOutput
+from cadam3d.core.rendering import OverflowedError, RenderFn, RenderOutput
 
 # The signature of :meth:`Rasterizer.render`.
 Render = Callable[[Gaussians, Cameras, Tensor, bool], RenderOutput]

@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.compiled.build import SIMD, Library, Names, build, load
+from cadam3d.compiled.library import SIMD, Names, NativeLibrary, build, load
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.io.cache import kernels_dir
 from cadam3d.rasterizer.base import KERNELS, Backend, Rasterizer, definitions
 from cadam3d.rasterizer.native import RenderPass, require_shapes, run_pass
@@ -55,9 +55,9 @@ class CpuRasterizer(Rasterizer):
         return super().prepare(device)
 
 
-def cpu_library() -> Library:
+def cpu_library() -> NativeLibrary:
     """Return the description of the kernels."""
-    return Library("rasterizer", NAMES, SOURCES, tuple(definitions()), "cadam3d_self_test")
+    return NativeLibrary("rasterizer", NAMES, SOURCES, tuple(definitions()), "cadam3d_self_test")
 
 
 @cache

@@ -38,7 +38,7 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.device import upload_together
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.io.cache import kernels_dir
 from cadam3d.rasterizer import workspace
 from cadam3d.rasterizer.base import Backend, Rasterizer

@@ -32,7 +32,7 @@ from torch.autograd.function import once_differentiable
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.rasterizer.base import ALPHA_MIN, BLUR, FAR, NEAR, Backend, Rasterizer, absgrad_probe
 from cadam3d.rasterizer.native import plain, require_shapes
 from cadam3d.rasterizer.reference import QUAT_SQUARE_MIN, ReferenceRasterizer

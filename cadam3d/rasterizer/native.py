@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.rasterizer.base import absgrad_probe
 
 # The numbers of coefficients of degree 0 to 3.

@@ -3,7 +3,7 @@
 The result is always a cubin for a real architecture, never PTX, because a driver refuses PTX from a newer
 compiler. The name of a cached file contains the architecture and two hashes: of the sources, constants,
 options and compiler version, and of the file's own bytes. So a new release, another torch or a damaged file
-each lead to a fresh build. The file and its folder must belong to the user, as in ``compiled/build.py``. No
+each lead to a fresh build. The file and its folder must belong to the user, as in ``compiled/library.py``. No
 lock is needed: every process renames its finished file into place, and any such file that matches its name is
 usable.
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from cadam3d.compiled.build import Names, build_folder, find_intact, keep, own_folder, short_hash
+from cadam3d.compiled.library import Names, build_folder, find_intact, keep, own_folder, short_hash
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer.base import KERNELS, definitions
 

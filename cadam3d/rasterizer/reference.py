@@ -27,7 +27,7 @@ from torch.autograd.function import once_differentiable
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.core.sh import evaluate_sh
 from cadam3d.rasterizer.base import (
     ALPHA_MAX,

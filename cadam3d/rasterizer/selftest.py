@@ -19,7 +19,7 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, orbit
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 

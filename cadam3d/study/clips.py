@@ -15,7 +15,7 @@ from PIL import Image
 
 from cadam3d.core.cameras import Cameras, turntable
 from cadam3d.core.checks import require_color, require_range, require_whole
-from cadam3d.core.render import RenderFn
+from cadam3d.core.rendering import RenderFn
 from cadam3d.io.image import to_uint8
 
 FOV_Y_DEG = 40.0  # at distance 3 the unit ball just fits

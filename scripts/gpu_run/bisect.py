@@ -21,7 +21,7 @@ from rasterizer_bench.scenes import make_scene as bench_scene
 from rasterizer_bench.stages import KernelRasterizer, stages_of
 from torch import Tensor
 
-from cadam3d.compiled.build import find_compiler
+from cadam3d.compiled.library import find_compiler
 from cadam3d.core.gaussians import FIELDS
 from cadam3d.rasterizer.driver import Launch, Launcher
 from cadam3d.rasterizer.selftest import IMAGES, Agreement, self_test

@@ -12,8 +12,8 @@ import torch
 from cadam3d.commands import doctor_kernels
 from cadam3d.commands.doctor_kernels import TRACER, check_kernels
 from cadam3d.commands.finding import Finding, Verdict, attempt
-from cadam3d.compiled import build
-from cadam3d.compiled.build import find_compiler
+from cadam3d.compiled import library
+from cadam3d.compiled.library import find_compiler
 from cadam3d.io.cache import kernels_dir
 from cadam3d.rasterizer import auto, gsplat, nvrtc
 from cadam3d.rasterizer.base import Backend
@@ -42,7 +42,7 @@ def empty_caches():
 def bare(monkeypatch, tmp_path):
     """Simulate a machine without compilers, compiled kernels and GPUs."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(build, "find_compiler", lambda: None)
+    monkeypatch.setattr(library, "find_compiler", lambda: None)
     monkeypatch.setattr(nvrtc, "find_compiler", lambda: None)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
 
@@ -81,8 +81,8 @@ def test_the_native_kernels_are_named_and_tested():
     ("seconds", "words"), [(0.0, "from the cache in "), (1.26, "compiled now in 1.3 s, kept in ")]
 )
 def test_the_finding_states_whether_kernels_were_compiled_now(seconds, words, monkeypatch):
-    built = replace(build.build(cpu_library(), kernels_dir(None)), seconds=seconds)
-    monkeypatch.setattr(build, "build", lambda library, cache_dir: built)
+    built = replace(library.build(cpu_library(), kernels_dir(None)), seconds=seconds)
+    monkeypatch.setattr(library, "build", lambda library, cache_dir: built)
     finding = doctor_kernels._cpu_kernels()
     assert words in finding.found
     assert finding.facts["compiled_now"] is (seconds > 0)
@@ -226,7 +226,7 @@ def test_a_native_tracer_that_draws_something_else_is_broken(monkeypatch):
 
 def test_without_a_compiler_the_tracer_in_torch_is_named_with_the_reason(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(build, "find_compiler", lambda: None)
+    monkeypatch.setattr(library, "find_compiler", lambda: None)
     finding = attempt(TRACER, doctor_kernels._tracer)
     assert finding.verdict is Verdict.NOTE
     assert finding.found.startswith("torch, which is slow: prior.tracer=native: expected a C++ compiler")

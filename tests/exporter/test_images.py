@@ -7,7 +7,7 @@ import torch
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.exporter.images import ImagesExporter
 
 VALUES = {"views": 4, "elevations_deg": [0.0, 30.0], "distance": 3.0, "fov_y_deg": 40.0, "size": 6}

@@ -7,7 +7,7 @@ import torch
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.exporter.preview import PreviewExporter
 
 SETTINGS = {

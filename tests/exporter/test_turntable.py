@@ -8,7 +8,7 @@ import torch
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput, Subject
+from cadam3d.core.rendering import RenderOutput, Subject
 from cadam3d.exporter.turntable import TurntableExporter
 
 SETTINGS = {

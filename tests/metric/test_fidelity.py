@@ -5,7 +5,7 @@ import torch
 
 from cadam3d.core.cameras import turntable
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput, Truth
+from cadam3d.core.rendering import RenderOutput, Truth
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.fidelity import Fidelity
 

@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from splats import make_gaussians
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.metric import hps
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.hps import Hps

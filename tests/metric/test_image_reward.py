@@ -18,7 +18,7 @@ from protocols import ring
 from splats import make_gaussians
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.metric import image_reward
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.image_reward import ImageReward

@@ -11,7 +11,7 @@ from splats import make_gaussians
 from cadam3d.build import component, components
 from cadam3d.core.cameras import turntable
 from cadam3d.core.gaussians import Gaussians, concatenate
-from cadam3d.core.render import RenderOutput, Truth
+from cadam3d.core.rendering import RenderOutput, Truth
 from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.janus import VIEWS, Janus
 from cadam3d.metric.scoring import Scorer

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import Truth
+from cadam3d.core.rendering import Truth
 from cadam3d.metric import mesh
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.mesh import MeshMetric, distances_between, true_surfaces

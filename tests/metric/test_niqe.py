@@ -18,7 +18,7 @@ from protocols import ring
 from splats import make_gaussians
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.metric import natural
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.niqe import OWN_NAME, OWN_PARAMETERS, Niqe

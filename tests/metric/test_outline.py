@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import RenderOutput, Truth
+from cadam3d.core.rendering import RenderOutput, Truth
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.outline import Outline
 

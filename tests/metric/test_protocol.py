@@ -7,7 +7,7 @@ import torch
 
 from cadam3d.build import option
 from cadam3d.core.errors import UserError
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.metric.protocol import Protocol, RingProtocol, SphereProtocol
 
 PICTURES = {

@@ -9,7 +9,7 @@ from splats import make_gaussians
 
 from cadam3d.core.cameras import vertical_turn
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.render import Truth
+from cadam3d.core.rendering import Truth
 from cadam3d.metric import turn
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.fidelity import Fidelity

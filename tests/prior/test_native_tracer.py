@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from cadam3d.compiled import build as build_module
-from cadam3d.compiled.build import FLAGS, SIMD, build, find_compiler, load
+from cadam3d.compiled import library as build_module
+from cadam3d.compiled.library import FLAGS, SIMD, build, find_compiler, load
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
 from cadam3d.core.errors import UserError
 from cadam3d.prior.shapes import ShapesPrior, native_tracer, solids

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from cadam3d.compiled.build import find_compiler
+from cadam3d.compiled.library import find_compiler
 from cadam3d.core.cameras import Cameras, turntable
 from cadam3d.io.cache import TRACES
 from cadam3d.prior.shapes import trace_cache

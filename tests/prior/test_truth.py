@@ -9,7 +9,7 @@ from composed import composed
 from cadam3d.build import component
 from cadam3d.core.cameras import Cameras, turntable
 from cadam3d.core.errors import UserError
-from cadam3d.core.render import Truth
+from cadam3d.core.rendering import Truth
 from cadam3d.prior.truth import NoTruth, PriorTruth, ShapesTruth
 
 PROMPT = "a mug"

@@ -9,8 +9,8 @@ from filelock import FileLock
 from mutants import MUTANTS, plant
 from splats import Backend
 
-from cadam3d.compiled import build as build_module
-from cadam3d.compiled.build import Build, build, find_compiler
+from cadam3d.compiled import library as build_module
+from cadam3d.compiled.library import Build, build, find_compiler
 from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.cpu import CpuRasterizer, cpu_library
 from cadam3d.rasterizer.cuda import CudaRasterizer

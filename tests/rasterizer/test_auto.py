@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from cadam3d.commands import messages
-from cadam3d.compiled.build import find_compiler
+from cadam3d.compiled.library import find_compiler
 from cadam3d.core.cameras import turntable
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians

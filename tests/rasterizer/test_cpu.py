@@ -19,7 +19,7 @@ from splats import (
     render_and_differentiate,
 )
 
-from cadam3d.compiled.build import load
+from cadam3d.compiled.library import load
 from cadam3d.rasterizer.cpu import instruction_set, rasterize
 
 

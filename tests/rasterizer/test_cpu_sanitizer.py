@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from emulation import content_hash, make_once
 
-from cadam3d.compiled.build import SIMD, find_compiler
+from cadam3d.compiled.library import SIMD, find_compiler
 from cadam3d.rasterizer.base import KERNELS, definitions
 from cadam3d.rasterizer.cpu import SOURCES
 

@@ -10,7 +10,7 @@ import pytest
 from emulation import build_emulator
 from mutants import plant
 
-from cadam3d.compiled.build import find_compiler
+from cadam3d.compiled.library import find_compiler
 
 pytestmark = pytest.mark.slow
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from splats import backgrounds, make_cameras, make_gaussians
 
-from cadam3d.compiled.build import find_compiler
+from cadam3d.compiled.library import find_compiler
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import driver
 from cadam3d.rasterizer.cuda import (

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, orbit, turntable
 from cadam3d.core.gaussians import FIELDS, Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.core.sh import rgb_to_sh0, sh_basis
 from cadam3d.rasterizer import reference
 from cadam3d.rasterizer.cpu import CpuRasterizer

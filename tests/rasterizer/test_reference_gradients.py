@@ -14,7 +14,7 @@ from torch.autograd import gradcheck
 
 from cadam3d.core.cameras import Cameras, orbit
 from cadam3d.core.gaussians import FIELDS, Gaussians
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
 OUTPUTS: dict[str, Callable[[RenderOutput], Tensor]] = {

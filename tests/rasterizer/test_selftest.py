@@ -7,7 +7,7 @@ import pytest
 import torch
 from splats import undecided
 
-from cadam3d.compiled.build import find_compiler
+from cadam3d.compiled.library import find_compiler
 from cadam3d.core.gaussians import FIELDS, Gaussians
 from cadam3d.rasterizer import reference
 from cadam3d.rasterizer.base import NEAR, Rasterizer

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from cadam3d.compiled.build import find_cached, find_compiler, load
+from cadam3d.compiled.library import find_cached, find_compiler, load
 from cadam3d.rasterizer import base
 from cadam3d.rasterizer.base import CONSTANTS, KERNELS
 from cadam3d.rasterizer.cpu import SOURCES, cpu_library

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from cadam3d.compiled.build import SIMD, Build, Library, Names, build, load
+from cadam3d.compiled.library import SIMD, Build, Names, NativeLibrary, build, load
 from cadam3d.core.cameras import Cameras
 from cadam3d.io.cache import kernels_dir
 from cadam3d.prior.shapes import tracer
@@ -24,7 +24,7 @@ CONSTANTS = ("MARCH_STEPS", "COMPACT_EVERY", "HIT_DISTANCE", "GRAZE_DISTANCE", "
 CONSTANTS += ("NORMAL_STEP", "AMBIENT", "SKY", "DIFFUSE", "WRAP", "SPOTS", "SPOT_COSINE")
 
 
-def tracer_library(key: str = "prior.tracer") -> Library:
+def tracer_library(key: str = "prior.tracer") -> NativeLibrary:
     """Return the description of the native tracer, with ``key`` in its messages.
 
     The numbers of kinds and patterns are definitions, like the constants.
@@ -34,7 +34,7 @@ def tracer_library(key: str = "prior.tracer") -> Library:
     values |= {f"PATTERN_{name.upper()}": number for number, name in enumerate(PATTERN_NAMES)}
     definitions = tuple(f"-DTRACE_{name}={value!r}" for name, value in values.items())
     names = Names(f"{key}=native", fallback=f"{key}=torch")
-    return Library("tracer", names, SOURCES, definitions, "cadam3d_trace_self_test")
+    return NativeLibrary("tracer", names, SOURCES, definitions, "cadam3d_trace_self_test")
 
 
 def load_tracer(key: str = "prior.tracer") -> tuple[Build, ctypes.CDLL]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
 from cadam3d.core.checks import fail, require_choice, require_range, require_whole
-from cadam3d.core.render import Truth
+from cadam3d.core.rendering import Truth
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import NoisePath, Prediction, per_view
 from cadam3d.prior.shapes.array_cache import cached_arrays

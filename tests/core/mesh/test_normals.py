@@ -5,7 +5,7 @@ import torch
 from cadam3d.core.cameras import turntable
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.mesh.normals import facing_normals, unit_normals
-from cadam3d.core.render import Subject
+from cadam3d.core.rendering import Subject
 from cadam3d.exporter.pictures import paint
 from cadam3d.rasterizer.base import render_fn
 from cadam3d.rasterizer.reference import ReferenceRasterizer

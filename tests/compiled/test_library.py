@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from cadam3d.compiled import build as module
-from cadam3d.compiled.build import (
+from cadam3d.compiled import library as module
+from cadam3d.compiled.library import (
     FLAGS,
     SIMD,
-    Library,
     Names,
+    NativeLibrary,
     build,
     find_cached,
     find_compiler,
@@ -46,9 +46,9 @@ def write_sources(folder: Path, answer: str = "0") -> tuple[Path, ...]:
 
 
 @pytest.fixture
-def library(tmp_path) -> Library:
+def library(tmp_path) -> NativeLibrary:
     """Return a library of one function, with a header and a definition."""
-    return Library("small", NAMES, (*write_sources(tmp_path / "sources"), SIMD), ("-DZERO=0",), "test")
+    return NativeLibrary("small", NAMES, (*write_sources(tmp_path / "sources"), SIMD), ("-DZERO=0",), "test")
 
 
 @pytest.fixture(scope="module")

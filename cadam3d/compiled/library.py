@@ -67,7 +67,7 @@ class Names:
 
 
 @dataclass(frozen=True)
-class Library:
+class NativeLibrary:
     """A native library: what it is made of, and how it is tested."""
 
     name: str  # the beginning of the names of its files
@@ -107,7 +107,7 @@ def find_compiler() -> Compiler | None:
     return None
 
 
-def find_cached(library: Library, cache_dir: Path, compiler: Compiler | None) -> Path | None:
+def find_cached(library: NativeLibrary, cache_dir: Path, compiler: Compiler | None) -> Path | None:
     """Return an intact file for these sources and this machine, or ``None`` if there is none.
 
     Only files built by ``compiler`` count, or by any compiler if that is ``None``.
@@ -116,7 +116,9 @@ def find_cached(library: Library, cache_dir: Path, compiler: Compiler | None) ->
     return find_intact(cache_dir, f"{library.name}-{_key(library)}-{by}-*{SUFFIX}")
 
 
-def build(library: Library, cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAGS) -> Build:
+def build(
+    library: NativeLibrary, cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAGS
+) -> Build:
     """Return the library in ``cache_dir``, and compile it if it is missing.
 
     ``machine_flags`` are alternatives, tried in turn. Raises :class:`UserError` if there is neither a cached
@@ -212,7 +214,7 @@ def short_hash(content: str | bytes) -> str:
 
 
 def _compile(
-    library: Library, compiler: Compiler, target: Path, machine_flags: Sequence[Sequence[str]]
+    library: NativeLibrary, compiler: Compiler, target: Path, machine_flags: Sequence[Sequence[str]]
 ) -> Path:
     folders = dict.fromkeys(f"-I{path.parent}" for path in library.sources)
     complaint = ""
@@ -241,7 +243,7 @@ def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
         return subprocess.CompletedProcess(command, 1, "", str(error))
 
 
-def _key(library: Library) -> str:
+def _key(library: NativeLibrary) -> str:
     parts = [path.read_text() for path in library.sources]
     parts += [repr((library.flags, MACHINE_FLAGS)), *library.definitions]
     return short_hash("\0".join([*parts, _machine()]))

@@ -5,7 +5,7 @@ import torch
 from splats import make_gaussians
 
 from cadam3d.core.cameras import turntable
-from cadam3d.core.render import RenderOutput
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
 
