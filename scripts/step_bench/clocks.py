@@ -91,7 +91,7 @@ def clocks_around_functions(watch: Watch) -> list[tuple[Any, str, Any]]:
     import torch
 
     from cadam3d import trainer
-    from cadam3d.core import render
+    from cadam3d.core import rendering
     from cadam3d.optimizer import GaussianOptimizer
 
     # Older checkouts have functions that this one lacks, and lack some that it has.
@@ -104,7 +104,7 @@ def clocks_around_functions(watch: Watch) -> list[tuple[Any, str, Any]]:
             "displace": "optimizer",
         },
         trainer.Trainer: {"_refine": "refinement", "_report": "callbacks", "_tell": "callbacks"},
-        render: {"read_numbers": "readback"},
+        rendering: {"read_numbers": "readback"},
         trainer: {"read_numbers": "readback"},
     }
     return [
