@@ -29,6 +29,7 @@ github.com/sparkjsdev/spark (both layouts); and measurements. splat-transform 3.
 here the same numbers as this module, to the bit, and the other way round.
 """
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,7 @@ from cadam3d.io.encoding import (
 from cadam3d.io.frames import UPS
 from cadam3d.io.gathering import gathered
 from cadam3d.io.ply import REST_SIZES, VERTEX, rest_size
-from cadam3d.io.ply_tables import PlyHeader, header_text, read_header, read_tables
+from cadam3d.io.ply_tables import PlyHeader, columns, header_text, read_header, read_tables
 from cadam3d.io.reading import unusable
 
 CHUNK_ROWS = 256
@@ -122,16 +123,16 @@ def read_compressed_ply(path: Path, *, up: str = "-y") -> Gaussians:
     """
     require_choice("up", up, UPS)
     header = read_header(path)
-    size = _require_layout(header)
-    has_colors = set(COLOR_BOUNDS) <= set(_names(header, "chunk"))
-    limits = [*POSITION_BOUNDS, *SCALE_BOUNDS, *(COLOR_BOUNDS if has_colors else [])]
+    size = rest_size(header, "sh")
     rest_names = [f"f_rest_{i}" for i in range(size)]
-    tables = read_tables(
-        header, {"chunk": limits, VERTEX: PACKED} | ({"sh": rest_names} if rest_names else {})
-    )
+    chunk = header.element("chunk")
+    has_colors = chunk is not None and set(COLOR_BOUNDS) <= set(chunk.names)
+    limits = [*POSITION_BOUNDS, *SCALE_BOUNDS, *(COLOR_BOUNDS if has_colors else [])]
+    wanted = {"chunk": limits, VERTEX: PACKED} | ({"sh": rest_names} if size else {})
+    tables = read_tables(header, wanted)
     vertices, count = tables[VERTEX], len(tables[VERTEX])
-    with np.errstate(over="ignore", invalid="ignore"):
-        chunks = np.stack([tables["chunk"][name].astype(np.float32) for name in limits], axis=1)
+    _require_layout(path, tables, rest_names)
+    chunks = columns(tables["chunk"], limits)
     if not has_colors:
         chunks = np.pad(chunks, ((0, 0), (0, 6)))
         chunks[:, 15:] = 1
@@ -166,46 +167,21 @@ def read_compressed_ply(path: Path, *, up: str = "-y") -> Gaussians:
 
 def is_compressed(header: PlyHeader) -> bool:
     """Return whether a PLY file has the packed properties of a compressed PLY."""
-    return "packed_position" in _names(header, VERTEX)
+    vertex = header.element(VERTEX)
+    return vertex is not None and "packed_position" in vertex.names
 
 
-def _names(header: PlyHeader, element: str) -> list[str]:
-    found = header.element(element)
-    return found.names if found else []
-
-
-def _require_layout(header: PlyHeader) -> int:
-    """Return the number of higher SH coefficients. Raises ``UserError`` for anything but a compressed PLY."""
-    path = header.path
-    wanted = {"chunk": [*POSITION_BOUNDS, *SCALE_BOUNDS], VERTEX: PACKED}
-    for element, names in wanted.items():
-        if missing := [name for name in names if name not in _names(header, element)]:
-            raise unusable(
-                path, f"not a compressed ply: element {element} has no properties {', '.join(missing)}"
-            )
-    chunk, vertex, sh = (header.element(name) for name in ("chunk", VERTEX, "sh"))
-    assert chunk is not None
-    assert vertex is not None
-    _require_types(path, "u4", [pair for pair in vertex.properties if pair[0] in PACKED])
-    needed = -(-vertex.count // CHUNK_ROWS)
-    if chunk.count != needed:
-        problem = f"{vertex.count} Gaussians need {needed} chunks, got {chunk.count}"
+def _require_layout(path: Path, tables: Mapping[str, np.ndarray], rest_names: Sequence[str]) -> None:
+    """Raise ``UserError`` unless the tables have the types and numbers of rows of a compressed PLY."""
+    vertices = tables[VERTEX]
+    kinds = {vertices.dtype[name].str[1:] for name in PACKED}
+    rest_kinds = {tables["sh"].dtype[name].str[1:] for name in rest_names}
+    is_whole = len(tables["chunk"]) == -(-len(vertices) // CHUNK_ROWS)
+    if rest_names:
+        is_whole &= len(tables["sh"]) == len(vertices)
+    if kinds != {"u4"} or not rest_kinds <= {"u1"} or not is_whole:
+        problem = "its elements have other types or numbers of rows than the format"
         raise unusable(path, f"not a compressed ply: {problem}")
-    if sh is None:
-        return 0
-    if sh.count != vertex.count:
-        problem = f"{vertex.count} Gaussians, but {sh.count} rows of element sh"
-        raise unusable(path, f"not a compressed ply: {problem}")
-    _require_types(path, "u1", [pair for pair in sh.properties if pair[0].startswith("f_rest_")])
-    return rest_size(path, sh.names)
-
-
-def _require_types(path: Path, wanted: str, properties: list[tuple[str, str]]) -> None:
-    names = {"u1": "uchar", "u4": "uint"}
-    for name, kind in properties:
-        if kind != wanted:
-            problem = f"expected {names[wanted]} for property {name[:40]}, got another type"
-            raise unusable(path, f"not a compressed ply: {problem}")
 
 
 def _require_finite(path: Path, gaussians: Gaussians) -> None:

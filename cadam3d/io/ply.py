@@ -20,7 +20,6 @@ and reading never allocates more than a few times its size.
 """
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +31,7 @@ from cadam3d.io.atomic import replacing
 from cadam3d.io.encoding import as_tensor, in_file_axes
 from cadam3d.io.frames import UPS
 from cadam3d.io.gathering import gathered
-from cadam3d.io.ply_tables import PlyHeader, header_text, read_header, read_tables
+from cadam3d.io.ply_tables import PlyHeader, columns, header_text, read_header, read_tables
 from cadam3d.io.reading import unusable
 
 VERTEX = "vertex"
@@ -68,7 +67,7 @@ def write_ply(path: Path, gaussians: Gaussians, *, up: str, pad_sh: int) -> None
     rest = np.zeros((len(local), 3, rest_size // 3), dtype=np.float32)
     rest[:, :, : local.sh.shape[1] - 1] = arrays["sh"][:, 1:].transpose(0, 2, 1)
 
-    columns = [
+    blocks = [
         arrays["means"],
         np.zeros((len(local), len(NORMALS)), dtype=np.float32),
         arrays["sh"][:, 0],
@@ -79,7 +78,7 @@ def write_ply(path: Path, gaussians: Gaussians, *, up: str, pad_sh: int) -> None
     ]
     names = [*COLUMNS["means"], *NORMALS, *SH0, *(f"f_rest_{i}" for i in range(rest_size))]
     names += [*COLUMNS["opacity_logits"], *COLUMNS["log_scales"], *COLUMNS["quats"]]
-    body = np.concatenate(columns, axis=1).astype("<f4", copy=False)
+    body = np.concatenate(blocks, axis=1).astype("<f4", copy=False)
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(header_text(up, {VERTEX: (len(local), [f"float {name}" for name in names])}))
         file.write(body.tobytes())
@@ -94,31 +93,23 @@ def read_ply(path: Path, *, up: str = "-y") -> Gaussians:
     """
     require_choice("up", up, UPS)
     header = read_header(path)
-    size = _rest_size(header)
+    size = rest_size(header, VERTEX)
     rest = [f"f_rest_{i}" for i in range(size)]
     table = read_tables(header, {VERTEX: [*REQUIRED, *rest]})[VERTEX]
 
     def local(rows: slice) -> Gaussians:
         some = table[rows]
-        higher = _columns(some, rest).reshape(len(some), 3, size // 3).transpose(0, 2, 1)
-        opacities = _columns(some, COLUMNS["opacity_logits"])[:, 0]
+        higher = columns(some, rest).reshape(len(some), 3, size // 3).transpose(0, 2, 1)
+        opacities = columns(some, COLUMNS["opacity_logits"])[:, 0]
         return Gaussians(
-            means=as_tensor(_columns(some, COLUMNS["means"])),
-            log_scales=as_tensor(_columns(some, COLUMNS["log_scales"])),
-            quats=as_tensor(_columns(some, COLUMNS["quats"])),
+            means=as_tensor(columns(some, COLUMNS["means"])),
+            log_scales=as_tensor(columns(some, COLUMNS["log_scales"])),
+            quats=as_tensor(columns(some, COLUMNS["quats"])),
             opacity_logits=as_tensor(opacities if header.up else _finite_logits(opacities)),
-            sh=as_tensor(np.concatenate([_columns(some, SH0)[:, None], higher], axis=1)),
+            sh=as_tensor(np.concatenate([columns(some, SH0)[:, None], higher], axis=1)),
         )
 
     return gathered(path, len(table), REST_SIZES.index(size), header.up or up, local)
-
-
-def _columns(table: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Return properties as columns of float32."""
-    # A double may be too large for a float, and a NaN may warn; both are refused later.
-    with np.errstate(over="ignore", invalid="ignore"):
-        found = [table[name].astype(np.float32, copy=False) for name in names]
-    return np.stack(found, axis=1) if found else np.zeros((len(table), 0), dtype=np.float32)
 
 
 def _finite_logits(logits: np.ndarray) -> np.ndarray:
@@ -145,12 +136,9 @@ def read_points(header: PlyHeader) -> tuple[np.ndarray, np.ndarray | None]:
     bits. Raises ``UserError`` if the file has no vertices with positions, or is damaged.
     """
     vertex = header.element(VERTEX)
-    names = vertex.names if vertex else []
-    if missing := [name for name in COLUMNS["means"] if name not in names]:
-        raise unusable(header.path, f"cannot be read as points: its vertices have no {', '.join(missing)}")
-    colors = COLORS if set(COLORS) <= set(names) else []
+    colors = COLORS if vertex and set(COLORS) <= set(vertex.names) else []
     table = read_tables(header, {VERTEX: [*COLUMNS["means"], *colors]})[VERTEX]
-    points = _columns(table, COLUMNS["means"])
+    points = columns(table, COLUMNS["means"])
     if not colors:
         return points, None
     rgb = np.stack([_color_bytes(table[name]) for name in colors], axis=1)
@@ -164,28 +152,14 @@ def _color_bytes(values: np.ndarray) -> np.ndarray:
     return np.nan_to_num(np.clip(scaled, 0, 255)).astype(np.uint8)
 
 
-def _rest_size(header: PlyHeader) -> int:
-    """Return the number of rest coefficients. Raises ``UserError`` if the file does not hold Gaussians."""
-    vertex = header.element(VERTEX)
-    if vertex is None:
-        raise unusable(header.path, "not a Gaussian ply: it has no vertices")
-    names = vertex.names
-    if missing := [name for name in REQUIRED if name not in names]:
-        raise unusable(header.path, f"not a Gaussian ply: properties missing: {', '.join(missing)}")
-    return rest_size(header.path, names)
-
-
-def rest_size(path: Path, names: Sequence[str]) -> int:
-    """Return how many of the properties ``names`` are rest coefficients.
+def rest_size(header: PlyHeader, name: str) -> int:
+    """Return how many properties of the element ``name`` are rest coefficients.
 
     Raises ``UserError`` if their number fits no SH degree.
     """
-    size = sum(re.fullmatch(r"f_rest_[0-9]+", name) is not None for name in names)
-    if size not in REST_SIZES or any(f"f_rest_{i}" not in names for i in range(size)):
+    element = header.element(name)
+    size = sum(re.fullmatch(r"f_rest_[0-9]+", each) is not None for each in element.names) if element else 0
+    if size not in REST_SIZES:
         sizes = ", ".join(map(str, REST_SIZES))
-        raise unusable(
-            path,
-            f"not a Gaussian ply: expected f_rest_0.. for SH degree 0 to {MAX_DEGREE} ({sizes} of them), "
-            f"got {size}",
-        )
+        raise unusable(header.path, f"expected {sizes} properties f_rest_0 and so on, got {size}")
     return size
