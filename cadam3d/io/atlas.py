@@ -106,39 +106,17 @@ def _nearest(
 
     The second array has the distances, 0 inside a triangle.
     """
-    weights = _barycentric(corners, points)
-    outside = np.flatnonzero((weights < 0).any(1))
-    corners, points = corners[outside], points[outside]
-    nearest, distance = np.zeros((len(outside), 3)), np.full(len(outside), np.inf)
-    for first, second in ((0, 1), (1, 2), (2, 0)):
-        begin, along = corners[:, first], corners[:, second] - corners[:, first]
-        length = np.maximum((along * along).sum(1), 1e-30)
-        share = np.clip(((points - begin) * along).sum(1) / length, 0, 1)
-        gap = np.linalg.norm(points - begin - share[:, None] * along, axis=1)
-        nearer = gap < distance
-        distance[nearer] = gap[nearer]
-        nearest[nearer] = 0
-        nearest[nearer, first], nearest[nearer, second] = 1 - share[nearer], share[nearer]
-    weights[outside] = nearest
-    every = np.zeros(len(weights))
-    every[outside] = distance
-    return weights, every
+    from trimesh.triangles import closest_point, points_to_barycentric  # slow to import
 
-
-def _barycentric(
-    corners: Float[np.ndarray, "t 3 2"], points: Float[np.ndarray, "t 2"]
-) -> Float[np.ndarray, "t 3"]:
-    """Return the weights of the corners that make each point; -1 for triangles without an area."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    along, across, away = b - a, c - a, points - a
-    area = along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]
-    is_flat = np.abs(area) < 1e-12
-    safe = np.where(is_flat, 1.0, area)
-    second = (away[:, 0] * across[:, 1] - away[:, 1] * across[:, 0]) / safe
-    third = (along[:, 0] * away[:, 1] - along[:, 1] * away[:, 0]) / safe
-    weights = np.stack([1 - second - third, second, third], axis=1)
-    weights[is_flat] = -1.0
-    return weights
+    flat = np.pad(corners, ((0, 0), (0, 0), (0, 1)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        places = closest_point(flat, np.pad(points, ((0, 0), (0, 1))))
+        weights = points_to_barycentric(flat, places)
+    # A triangle without an area has no such weights; its first corner counts.
+    is_flat = ~np.isfinite(weights).all(1)
+    weights[is_flat], places[is_flat, :2] = (1, 0, 0), corners[is_flat, 0]
+    weights = np.clip(weights, 0, 1)
+    return weights / weights.sum(1, keepdims=True), np.linalg.norm(points - places[:, :2], axis=1)
 
 
 def _filled(picture: np.ndarray, is_painted: Bool[np.ndarray, "h w"]) -> np.ndarray:

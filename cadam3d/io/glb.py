@@ -27,22 +27,16 @@ negative".
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from cadam3d import __version__
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import SH_C0
-from cadam3d.io.atomic import replacing
 from cadam3d.io.encoding import in_file_axes, linear_scales, opacities, to_bytes, unit_quats
-from cadam3d.io.gltf import FLOAT, LARGEST_FILE, UNSIGNED_BYTE, VERTEX_BUFFER, binary_gltf, linear
+from cadam3d.io.gltf import linear, write_gltf
 
 EXTENSION = "KHR_gaussian_splatting"
 POINTS = 0  # the mode of drawing
-SPARE_BYTES = 1 << 20  # for the document
-TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def write_glb(path: Path, gaussians: Gaussians, *, up: str) -> None:
@@ -52,16 +46,15 @@ def write_glb(path: Path, gaussians: Gaussians, *, up: str) -> None:
     than 4 GB, which is the limit of the format.
     """
     local = in_file_axes(gaussians, up)
-    arrays = _attributes(local) if len(local) else {}
-    body_bytes = sum(array.nbytes for array in arrays.values())
-    if body_bytes > LARGEST_FILE - SPARE_BYTES:
-        raise UserError(
-            f"{path}: expected less than 4 GB, which is the limit of glb, got {body_bytes:,} bytes. "
-            "Try: 'exporter=[ply]'"
-        )
-    body = b"".join(array.tobytes() for array in arrays.values())
-    with replacing(path) as temporary:
-        temporary.write_bytes(binary_gltf(_document(path.stem, arrays), body))
+    splatting = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    primitive = {"mode": POINTS, "extensions": {EXTENSION: splatting}}
+    attributes = _attributes(local) if len(local) else {}
+    write_gltf(path, path.stem, attributes, primitive, extensionsUsed=[EXTENSION])
 
 
 def _attributes(local: Gaussians) -> dict[str, np.ndarray]:
@@ -81,51 +74,4 @@ def _attributes(local: Gaussians) -> dict[str, np.ndarray]:
     color = np.concatenate([linear(diffuse), alphas[:, None]], axis=1)
     return {name: np.ascontiguousarray(array, dtype="<f4") for name, array in floats.items()} | {
         "COLOR_0": to_bytes(255 * color)
-    }
-
-
-def _document(name: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Return the JSON of a scene with one node and, if there are arrays, one mesh of points."""
-    document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": f"cadam3d {__version__}"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": name}],
-    }
-    if not arrays:
-        return document
-    accessors, views, offset = [], [], 0
-    for index, (attribute, array) in enumerate(arrays.items()):
-        is_float = array.dtype.kind == "f"
-        accessor = {
-            "bufferView": index,
-            "componentType": FLOAT if is_float else UNSIGNED_BYTE,
-            "count": len(array),
-            "type": TYPES[array.shape[1]],
-        }
-        if not is_float:
-            accessor["normalized"] = True
-        if attribute == "POSITION":
-            accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
-        accessors.append(accessor)
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": VERTEX_BUFFER})
-        offset += array.nbytes
-    splatting = {
-        "kernel": "ellipse",
-        "colorSpace": "srgb_rec709_display",
-        "projection": "perspective",
-        "sortingMethod": "cameraDistance",
-    }
-    primitive = {
-        "attributes": {attribute: index for index, attribute in enumerate(arrays)},
-        "mode": POINTS,
-        "extensions": {EXTENSION: splatting},
-    }
-    document["nodes"] = [{"name": name, "mesh": 0}]
-    return document | {
-        "meshes": [{"name": name, "primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": offset}],
-        "extensionsUsed": [EXTENSION],
     }

@@ -1,23 +1,92 @@
-"""Binary glTF 2.0: the container of a JSON document and one buffer, for Gaussians and for meshes."""
+"""Binary glTF 2.0: one mesh in a JSON document and one buffer, for Gaussians and for triangles."""
 
 import json
 import struct
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from cadam3d import __version__
+from cadam3d.core.errors import UserError
+from cadam3d.io.atomic import replacing
+
 LARGEST_FILE = (1 << 32) - 1  # bytes; the file stores its length in 32 bits
+SPARE_BYTES = 1 << 20  # for the document
 HEADER = struct.Struct("<4sII")  # "glTF", version, length of the file
 CHUNK = struct.Struct("<I4s")  # length, kind
-# Types of numbers (glTF 2.0, section 3.6.2).
-FLOAT, UNSIGNED_BYTE, UNSIGNED_SHORT, UNSIGNED_INT = 5126, 5121, 5123, 5125
+# Types of numbers (glTF 2.0, section 3.6.2) by the kind of an array.
+COMPONENTS = {"f4": 5126, "u1": 5121, "u2": 5123, "u4": 5125}
+TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 # Uses of a part of the buffer (section 5.11.5).
 VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
 
 
-def binary_gltf(document: Mapping[str, Any], body: bytes) -> bytes:
+def write_gltf(
+    path: Path,
+    name: str,
+    attributes: Mapping[str, np.ndarray],
+    primitive: Mapping[str, Any],
+    *,
+    indices: np.ndarray | None = None,
+    picture: bytes = b"",
+    **document: Any,
+) -> None:
+    """Write a file with one mesh called ``name``, atomically; an empty scene without ``attributes``.
+
+    ``attributes`` are little-endian arrays [n c] by name, whose rows have a multiple of four bytes; integers
+    are normalized. ``primitive`` and ``document`` are further entries of the JSON. ``picture`` is a PNG, the
+    only image. Raises ``UserError`` if the file cannot be written, or would be larger than 4 GB.
+    """
+    arrays = [array for array in (indices, *attributes.values()) if array is not None]
+    blocks = [array.tobytes() for array in arrays] + [picture + bytes(-len(picture) % 4)]
+    body = b"".join(blocks)
+    if len(body) > LARGEST_FILE - SPARE_BYTES:
+        raise UserError(f"{path}: expected less than 4 GB, got {len(body):,} bytes. Try: 'exporter=[ply]'")
+    views: list[dict[str, Any]] = []
+    offset = 0
+    for block, array in zip(blocks, [*arrays, None], strict=True):
+        view = {"buffer": 0, "byteOffset": offset, "byteLength": len(block)}
+        if array is not None:
+            view["target"] = INDEX_BUFFER if array is indices else VERTEX_BUFFER
+        offset += len(block)
+        views += [view] if block else []
+    first = 0 if indices is None else 1
+    numbers = {attribute: number for number, attribute in enumerate(attributes, start=first)}
+    mesh = {"attributes": numbers, **primitive} | ({} if indices is None else {"indices": 0})
+    whole = {
+        "asset": {"version": "2.0", "generator": f"cadam3d {__version__}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": name}],
+    }
+    if attributes:
+        whole |= {
+            "nodes": [{"name": name, "mesh": 0}],
+            "meshes": [{"name": name, "primitives": [mesh]}],
+            "accessors": [_accessor(number, array) for number, array in enumerate(arrays)],
+            "bufferViews": views,
+            "buffers": [{"byteLength": len(body)}],
+            **document,
+        }
+        corners = attributes["POSITION"]
+        whole["accessors"][first] |= {"min": corners.min(0).tolist(), "max": corners.max(0).tolist()}
+    if picture:
+        whole["images"] = [{"bufferView": len(arrays), "mimeType": "image/png"}]
+    with replacing(path) as temporary:
+        temporary.write_bytes(_container(whole, body))
+
+
+def _accessor(number: int, array: np.ndarray) -> dict[str, Any]:
+    """Return the description of an array, which is the part ``number`` of the buffer."""
+    kind = array.dtype.str[1:]
+    accessor = {"bufferView": number, "componentType": COMPONENTS[kind], "count": len(array)}
+    return accessor | {"type": TYPES[array.shape[1]]} | ({"normalized": True} if kind in ("u1", "u2") else {})
+
+
+def _container(document: Mapping[str, Any], body: bytes) -> bytes:
     """Return the content of a file with ``document`` and the buffer ``body``, which may be empty."""
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
     text += b" " * (-len(text) % 4)

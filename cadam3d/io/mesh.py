@@ -7,7 +7,6 @@ colours apart. A texture is sRGB in every format. Vertex colours of obj (``v x y
 red green blue``) are sRGB by convention.
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,21 +20,14 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.mesh.surface import Surface, SurfaceFacts, facts
 from cadam3d.io.atomic import replacing
 from cadam3d.io.frames import points_to_file
-from cadam3d.io.gltf import (
-    FLOAT,
-    INDEX_BUFFER,
-    UNSIGNED_INT,
-    UNSIGNED_SHORT,
-    VERTEX_BUFFER,
-    binary_gltf,
-    linear,
-)
+from cadam3d.io.gltf import linear, write_gltf
 from cadam3d.io.ply_tables import header_text
 
 FORMATS = ("glb", "obj", "ply")
 # Constants of glTF for the sampling of textures.
 LINEAR, CLAMP = 9729, 33071
 NAME = "cadam3d"
+UNLIT = "KHR_materials_unlit"
 
 
 @dataclass(frozen=True)
@@ -65,9 +57,31 @@ def write_glb(path: Path, surface: Surface, *, up: str, texture: Texture | None 
     glTF defines ``+y`` as up; another ``up`` turns the numbers and not the definition. Raises ``UserError``
     if the file cannot be written.
     """
-    content = _glb(_in_file(surface, up, texture))
-    with replacing(path) as temporary:
-        temporary.write_bytes(content)
+    mesh = _in_file(surface, up, texture)
+    attributes = {"POSITION": mesh.positions, "NORMAL": mesh.normals}
+    shading: dict[str, object] = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}
+    material = {"name": NAME, "pbrMetallicRoughness": shading, "extensions": {UNLIT: {}}}
+    entries: dict[str, object] = {"extensionsUsed": [UNLIT], "materials": [material]}
+    if texture is None:
+        # Four numbers instead of three, because every element has to begin at a multiple of four bytes.
+        rgba = np.concatenate([linear(mesh.colors), np.ones((len(mesh.colors), 1))], axis=1)
+        attributes["COLOR_0"] = np.rint(rgba * 65535).astype("<u2")
+    else:
+        # glTF measures v from the upper edge.
+        flipped = np.stack([texture.uv[:, 0], 1 - texture.uv[:, 1]], axis=1)
+        attributes["TEXCOORD_0"] = flipped.astype("<f4")
+        shading["baseColorTexture"] = {"index": 0}
+        entries["textures"] = [{"sampler": 0, "source": 0}]
+        entries["samplers"] = [{"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP, "wrapT": CLAMP}]
+    write_gltf(
+        path,
+        NAME,
+        attributes,
+        {"material": 0},
+        indices=mesh.faces.reshape(-1, 1).astype("<u4"),
+        picture=b"" if texture is None else _png(texture),
+        **entries,
+    )
 
 
 def write_mesh_ply(path: Path, surface: Surface, *, up: str) -> None:
@@ -149,80 +163,6 @@ def _in_file(surface: Surface, up: str, texture: Texture | None) -> _Mesh:
     )
     faces = surface.faces if texture is None else texture.faces
     return _Mesh(positions, normals, surface.colors[rows], faces, texture)
-
-
-def _glb(mesh: _Mesh) -> bytes:
-    """Return the bytes of a binary glTF file with one mesh."""
-    columns: list[tuple[str, np.ndarray, int, str, bool]] = [
-        ("POSITION", mesh.positions, FLOAT, "VEC3", False),
-        ("NORMAL", mesh.normals, FLOAT, "VEC3", False),
-    ]
-    if mesh.texture is None:
-        # Four numbers instead of three, because every element has to begin at a multiple of four bytes.
-        rgba = np.concatenate([linear(mesh.colors), np.ones((len(mesh.colors), 1))], axis=1)
-        columns.append(("COLOR_0", np.rint(rgba * 65535).astype("<u2"), UNSIGNED_SHORT, "VEC4", True))
-    else:
-        # glTF measures v from the upper edge.
-        flipped = np.stack([mesh.texture.uv[:, 0], 1 - mesh.texture.uv[:, 1]], axis=1)
-        columns.append(("TEXCOORD_0", flipped.astype("<f4"), FLOAT, "VEC2", False))
-    blocks = [mesh.faces.astype("<u4").tobytes(), *(array.tobytes() for _, array, *_ in columns)]
-    targets: list[int | None] = [INDEX_BUFFER, *(VERTEX_BUFFER for _ in columns)]
-    accessors: list[dict[str, object]] = [
-        {"bufferView": 0, "componentType": UNSIGNED_INT, "count": mesh.faces.size, "type": "SCALAR"}
-    ]
-    for view, (name, array, kind, shape, is_normalized) in enumerate(columns, start=1):
-        accessor: dict[str, object] = {
-            "bufferView": view,
-            "componentType": kind,
-            "count": len(array),
-            "type": shape,
-        }
-        if is_normalized:
-            accessor["normalized"] = True
-        if name == "POSITION":
-            accessor |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
-        accessors.append(accessor)
-    surface: dict[str, object] = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}
-    document: dict[str, object] = {
-        "asset": {"version": "2.0", "generator": f"{NAME} {__version__}"},
-        "extensionsUsed": ["KHR_materials_unlit"],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": NAME}],
-    }
-    if mesh.texture is not None:
-        surface["baseColorTexture"] = {"index": 0}
-        document |= {
-            "textures": [{"sampler": 0, "source": 0}],
-            "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": CLAMP, "wrapT": CLAMP}],
-            "images": [{"bufferView": len(blocks), "mimeType": "image/png"}],
-        }
-        blocks.append(_png(mesh.texture))
-        targets.append(None)
-    attributes = {name: number for number, (name, *_) in enumerate(columns, start=1)}
-    material = {
-        "name": NAME,
-        "pbrMetallicRoughness": surface,
-        "doubleSided": False,
-        "extensions": {"KHR_materials_unlit": {}},
-    }
-    document |= {
-        "meshes": [{"name": NAME, "primitives": [{"attributes": attributes, "indices": 0, "material": 0}]}],
-        "materials": [material],
-        "accessors": accessors,
-    }
-    return _binary(document, blocks, targets)
-
-
-def _binary(document: Mapping[str, object], blocks: Sequence[bytes], targets: Sequence[int | None]) -> bytes:
-    """Return a glb with one buffer, in which each block is a buffer view."""
-    views, body = [], b""
-    for block, target in zip(blocks, targets, strict=True):
-        view = {"buffer": 0, "byteOffset": len(body), "byteLength": len(block)}
-        views.append(view if target is None else {**view, "target": target})
-        body += block + b"\0" * (-len(block) % 4)
-    whole = {**document, "bufferViews": views, "buffers": [{"byteLength": len(body)}]}
-    return binary_gltf(whole, body)
 
 
 def _bytes(rgb: Float[np.ndarray, "*batch 3"]) -> UInt8[np.ndarray, "*batch 3"]:

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cadam3d.core.checks import fail, require
+from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json
 
@@ -42,27 +42,6 @@ class ModelSource:
     revision: str | None  # on the hub
     variant: str | None  # of the weight files
 
-    def __post_init__(self) -> None:
-        key = self.key
-        paths = [self.path] if isinstance(self.path, str) else self.path
-        is_path = paths is None or (len(paths) > 0 and all(isinstance(each, str) and each for each in paths))
-        wanted = "a folder, a list of folders or null"
-        require(is_path, f"{key}.path", expected=wanted, got=self.path, example=f"{key}.path=DIR")
-        listed = isinstance(self.ids, Sequence) and not isinstance(self.ids, str)
-        require(
-            listed and all(isinstance(name, str) and name.count("/") == 1 for name in self.ids),
-            f"{key}.ids",
-            expected="a list of hub ids, each OWNER/NAME",
-            got=self.ids,
-            example=f"'{key}.ids=[stabilityai/stable-diffusion-3.5-medium]'",
-        )
-        for name in ("revision", "variant"):
-            value = getattr(self, name)
-            is_name = value is None or (isinstance(value, str) and value != "")
-            require(
-                is_name, f"{key}.{name}", expected="a name or null", got=value, example=f"{key}.{name}=null"
-            )
-
     def find(self, kinds: Sequence[str], others: Mapping[str, str], ask_hub: bool = True) -> "Pretrained":
         """Find the model and read its index; on the hub, the first available id is used.
 
@@ -71,63 +50,38 @@ class ModelSource:
         not installed, or with a reason for everything that was tried.
         """
         require_extra(self.key)
-        if self.path is None:
-            found = self._remote(ask_hub)
-        else:
-            found = self._local() if isinstance(self.path, str) else self._suitable(self.path, kinds)
-        kind = str(found.index.get("_class_name"))
-        if kind not in kinds:
-            advice = others.get(kind, f"another {self.key}.path")
-            raise UserError(
-                f"{self.key}: {found.where} is a {kind}, not a {' or '.join(kinds)}. Try: {advice}"
-            )
-        return found
+        paths = [self.path] if isinstance(self.path, str) else self.path
+        models = [self._remote(ask_hub)] if paths is None else [self._local(path) for path in paths]
+        for model in models:
+            if model.kind in kinds:
+                return model
+        raise fail(
+            f"{self.key}.path",
+            expected=f"a {' or '.join(kinds)}",
+            got=", ".join(f"{model.where} (a {model.kind})" for model in models),
+            example=others.get(models[0].kind if models else "", f"{self.key}.path=DIR"),
+        )
 
-    def _suitable(self, paths: Sequence[str], kinds: Sequence[str]) -> "Pretrained":
-        """Return the first model of a list whose class is one of ``kinds``.
-
-        Raises ``UserError`` if there is none, and if a folder has no model.
-        """
-        models = [replace(self, path=path)._local() for path in paths]
-        suitable = [model for model in models if model.index.get("_class_name") in kinds]
-        if not suitable:
-            got = ", ".join(f"{model.where} (a {model.index.get('_class_name')})" for model in models)
-            raise UserError(
-                f"{self.key}.path: expected a {' or '.join(kinds)} in the list, got {got}. "
-                f"Try: {self.key}.path=DIR"
-            )
-        return suitable[0]
-
-    def _local(self) -> "Pretrained":
-        path = str(self.path)
+    def _local(self, path: str) -> "Pretrained":
         is_packaged = path.startswith(PACKAGE)
         folder = MODELS / path.removeprefix(PACKAGE) if is_packaged else Path(path).expanduser()
-        if not (folder / INDEX).is_file():
-            expected = f"a folder with a {INDEX} (a model in the layout of diffusers)"
-            if is_packaged:
-                here = [PACKAGE + index.parent.name for index in sorted(MODELS.glob(f"*/{INDEX}"))]
-                expected = f"a model of this installation ({', '.join(here) or 'it has none'})"
+        index = folder / INDEX
+        if not index.is_file():
+            expected = f"a folder with a {INDEX}, as diffusers writes it"
             raise fail(f"{self.key}.path", expected=expected, got=path, example=f"{self.key}.path=DIR")
-        return Pretrained(self, str(folder), None, folder / INDEX, _read_entries(self.key, folder / INDEX))
+        return Pretrained(replace(self, path=path), str(folder), None, index, _read_entries(self.key, index))
 
     def _remote(self, can_ask: bool) -> "Pretrained":
-        require(
-            len(self.ids) > 0,
-            f"{self.key}.path",
-            expected=f"the folder of a model, since {self.key}.ids is empty",
-            got=self.path,
-            example=f"{self.key}.path=DIR",
-        )
         reasons: list[str] = []
         for name in self.ids:
             index, reason, can_ask = fetch_file(name, INDEX, self.revision, can_ask)
             if index is not None:
                 return Pretrained(self, name, self.revision, index, _read_entries(self.key, index))
             reasons.append(f"{name}: {reason}")
-        folder = f"models/{self.ids[0].split('/')[1]}"
+        first = self.ids[0] if self.ids else "ID"
         raise UserError(
-            f"{self.key}.ids: no model is available. {'; '.join(reasons)}. Try, with a network connection: "
-            f"hf download {self.ids[0]} --local-dir {folder}. Then: {self.key}.path={folder}"
+            f"{self.key}.ids: no model is available. {'; '.join(reasons)}. "
+            f"Try: hf download {first} --local-dir models, then {self.key}.path=models"
         )
 
 
@@ -141,10 +95,14 @@ class Pretrained:
     file: Path  # the index on this disk
     index: dict[str, Any]
 
+    @property
+    def kind(self) -> str:
+        """Return the pipeline class that the index names."""
+        return str(self.index.get("_class_name"))
+
     def has(self, part: str) -> bool:
         """Return whether the model has ``part``, such as ``"text_encoder_3"``."""
-        library, kind = (self.index.get(part) or (None, None))[:2]
-        return library is not None and kind is not None
+        return None not in (self.index.get(part) or [None])[:2]
 
     def part(self, name: str, dtype: torch.dtype | None = None) -> Any:
         """Load one part on the CPU; a network is frozen and in evaluation mode.
@@ -154,16 +112,17 @@ class Pretrained:
         options: dict[str, Any] = {"subfolder": name, "revision": self.revision}
         if dtype is not None:
             options |= {"dtype": dtype, "variant": self.source.variant}
-        _silence()
+        import diffusers
+        import transformers
+
+        transformers.utils.logging.disable_progress_bar()
+        diffusers.utils.logging.disable_progress_bar()
         try:
             loaded = self._kind(name).from_pretrained(self.where, **options)
         except (OSError, ValueError, KeyError, RuntimeError, TypeError) as error:
             if isinstance(error, torch.OutOfMemoryError):
                 raise
-            raise UserError(
-                f"{self.source.key}: {name} of {self.where} cannot be loaded ({short(error)}). "
-                f"Try: download it again, or another {self.source.key}.variant (now {self.source.variant})"
-            ) from error
+            raise self._unusable(f"{name} of {self.where} cannot be loaded ({short(error)})") from error
         if isinstance(loaded, torch.nn.Module):
             loaded.requires_grad_(False).eval()
         elif name.startswith("tokenizer"):
@@ -175,10 +134,7 @@ class Pretrained:
         kind = self._kind(name)
         file = "scheduler_config.json" if name == "scheduler" else "config.json"
         if Path(self.where).is_dir():
-            path = Path(self.where) / name / file
-            if not path.is_file():
-                raise UserError(f"{self.source.key}: {path} is missing. Try: download {self.where} again")
-            return _read_entries(self.source.key, path)
+            return _read_entries(self.source.key, Path(self.where) / name / file)
         if hasattr(kind, "load_config"):
             return dict(kind.load_config(self.where, subfolder=name, revision=self.revision))
         return kind.config_class.from_pretrained(self.where, subfolder=name, revision=self.revision).to_dict()
@@ -231,20 +187,19 @@ class Pretrained:
         wanted = self._kind(encoder).config_class.from_dict(self.config(encoder)).vocab_size
         # The encoder of T5 has room for a few more pieces than its tokenizer has.
         if size < wanted / 2:
-            raise UserError(
-                f"{self.source.key}: {name} of {self.where} knows {size} of the {wanted} pieces of text that "
-                f"{encoder} reads: files are missing. Try: download it again"
-            )
+            problem = f"{name} of {self.where} knows {size} of the {wanted} pieces of text of {encoder}"
+            raise self._unusable(problem)
 
     def _kind(self, name: str) -> Any:
         library, kind = (str(entry) for entry in (self.index.get(name) or (None, None))[:2])
         module = _module(library)
         if module is None or not hasattr(module, kind):
-            raise UserError(
-                f"{self.source.key}: the {name} of {self.where} is a {library}.{kind}, which the installed "
-                f"libraries do not have. Try: pip install -U 'cadam3d[diffusers]', or another model"
-            )
+            raise self._unusable(f"the installed libraries have no {library}.{kind}, its {name}")
         return getattr(module, kind)
+
+    def _unusable(self, problem: str) -> UserError:
+        """Return the error about a part that cannot be used."""
+        return UserError(f"{self.source.key}: {problem}. Try: {self.source.key}.path=DIR")
 
 
 def require_extra(key: str) -> None:
@@ -304,33 +259,18 @@ def read_tensors(key: str, file: Path) -> Mapping[str, Tensor]:
     try:
         if file.suffix == ".safetensors":
             return load_file(file)
-        content = _unpickle(file)
+        try:
+            content = torch.load(file, map_location="cpu", weights_only=True, mmap=True)
+        except RuntimeError:  # an old format that torch cannot map
+            content = torch.load(file, map_location="cpu", weights_only=True)
         tensors = content.get("state_dict", content)
         return {name: tensor for name, tensor in tensors.items() if torch.is_tensor(tensor)}
     # A damaged file makes its reader raise almost anything.
     except Exception as error:
-        raise UserError(
-            f"{key}: {file} is not a file of tensors ({short(error)}). "
-            f"Try: download it again, or use another {key}"
-        ) from error
-
-
-def _unpickle(file: Path) -> Any:
-    try:
-        return torch.load(file, map_location="cpu", weights_only=True, mmap=True)
-    except RuntimeError:  # an old format that torch cannot map
-        return torch.load(file, map_location="cpu", weights_only=True)
+        problem = f"{key}: {file} is not a file of tensors ({short(error)})"
+        raise UserError(f"{problem}. Try: another {key}") from error
 
 
 def short(error: Exception) -> str:
     """Return the message of another library's error in one line of at most 200 characters."""
     return " ".join(str(error).split())[:200]
-
-
-def _silence() -> None:
-    """Switch off the progress bars of other libraries."""
-    import diffusers
-    import transformers
-
-    transformers.utils.logging.disable_progress_bar()
-    diffusers.utils.logging.disable_progress_bar()

@@ -17,7 +17,7 @@ from formats import (
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.io import glb
+from cadam3d.io import gltf
 from cadam3d.io.frames import UPS, file_to_world
 from cadam3d.io.glb import write_glb
 
@@ -157,9 +157,7 @@ def test_the_same_gaussians_give_the_same_bytes(tmp_path):
 
 
 def test_a_file_beyond_the_limit_of_the_format_is_one_message(tmp_path, monkeypatch):
-    monkeypatch.setattr(glb, "LARGEST_FILE", 1000)
-    with pytest.raises(
-        UserError, match=r"less than 4 GB, which is the limit of glb, got .*Try: 'exporter=\[ply\]'$"
-    ):
+    monkeypatch.setattr(gltf, "LARGEST_FILE", 1000)
+    with pytest.raises(UserError, match=r"less than 4 GB, got .*Try: 'exporter=\[ply\]'$"):
         write_glb(tmp_path / "a.glb", random_gaussians(30), up="+y")
     assert not list(tmp_path.iterdir())

@@ -98,7 +98,6 @@ def test_a_glb_is_unlit_and_its_vertex_colours_are_linear(tmp_path):
     [material] = document["materials"]
     assert material["extensions"] == {"KHR_materials_unlit": {}}
     assert document["extensionsUsed"] == ["KHR_materials_unlit"]
-    assert material["doubleSided"] is False
     assert material["pbrMetallicRoughness"]["metallicFactor"] == 0
     rgba, accessor = array(tmp_path / "m.glb", "COLOR_0")
     assert accessor["normalized"] is True

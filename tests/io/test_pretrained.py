@@ -107,14 +107,14 @@ def test_the_identity_changes_with_the_files(model, tmp_path):
 def test_a_wrong_folder_is_reported_in_one_line(tmp_path):
     (tmp_path / "file").write_text("x")
     for path in ("/nowhere", tmp_path, tmp_path / "file"):
-        with pytest.raises(UserError, match=r"a folder with a model_index\.json") as caught:
+        with pytest.raises(UserError, match=r"model_index\.json") as caught:
             source(path=str(path)).find(KINDS, OTHERS)
         assert "\n" not in str(caught.value)
         assert "Try: prior.path=DIR" in str(caught.value)
 
 
 def test_a_model_of_another_kind_names_the_prior_to_use(model, tmp_path):
-    with pytest.raises(UserError, match=r"not a StableDiffusion3Pipeline\. Try: another prior\.path"):
+    with pytest.raises(UserError, match=r"expected a StableDiffusion3Pipeline, .* Try: prior\.path=DIR"):
         source(path=str(model)).find(("StableDiffusion3Pipeline",), OTHERS)
     index = {"_class_name": "StableDiffusion3Pipeline"}
     (tmp_path / "model_index.json").write_text(json.dumps(index))
@@ -130,13 +130,10 @@ def test_a_list_of_folders_serves_priors_of_different_kinds(model, tmp_path):
     assert both.find(KINDS, OTHERS).where == str(model)
     assert both.find(KINDS, OTHERS).identity == source(path=str(model)).find(KINDS, OTHERS).identity
     assert both.find(("StableDiffusion3Pipeline",), {}).where == str(other)
-    with pytest.raises(UserError, match=r"expected a SDXL in the list, got .* Try: prior\.path=DIR"):
+    with pytest.raises(UserError, match=r"expected a SDXL, got .* Try: prior\.path=DIR"):
         both.find(("SDXL",), {})
     with pytest.raises(UserError, match=r"got .*typo"):
         source(path=[str(model), str(tmp_path / "typo")]).find(KINDS, OTHERS)
-    for wrong in ([], [""]):
-        with pytest.raises(UserError, match="expected a folder, a list of folders or null"):
-            source(path=wrong)
 
 
 @pytest.mark.parametrize("text", ["", "no json", "[1]"])
@@ -213,22 +210,3 @@ def test_a_missing_extra_is_reported_with_the_command_that_installs_it(monkeypat
     monkeypatch.setattr(pretrained, "find_spec", lambda name: None if name == "diffusers" else object())
     with pytest.raises(UserError, match=r"prior: needs diffusers. Try: pip install 'cadam3d\[diffusers\]'"):
         source().find(KINDS, OTHERS)
-
-
-@pytest.mark.parametrize(
-    ("changes", "key"),
-    [
-        ({"path": ""}, "prior.path"),
-        ({"ids": "one/model"}, "prior.ids"),
-        ({"ids": ["one"]}, "prior.ids"),
-        ({"variant": ""}, "prior.variant"),
-    ],
-)
-def test_wrong_values_are_named(changes, key):
-    with pytest.raises(UserError, match=key):
-        source(**changes)
-
-
-def test_a_source_without_folder_and_ids_is_refused():
-    with pytest.raises(UserError, match=r"prior.path: expected the folder of a model"):
-        source(ids=[]).find(KINDS, OTHERS)

@@ -133,14 +133,13 @@ def test_a_size_far_from_that_of_the_training_gets_a_note(size, is_far, models, 
 
 def test_a_model_that_is_not_in_the_package_is_named(models):
     lacking = built("prior=stable_diffusion", "prior.path=package:shapes_xl").lacks()
-    assert "package:shapes_mvdream, package:shapes_sd, package:shapes_sd3" in lacking
     assert "got 'package:shapes_xl'" in lacking
 
 
 def test_a_package_without_models_is_reported(tmp_path, monkeypatch):
     pytest.importorskip("diffusers")
     monkeypatch.setattr(pretrained, "MODELS", tmp_path)
-    assert "a model of this installation (it has none)" in built("prior=shapes_sd").lacks()
+    assert "model_index.json" in built("prior=shapes_sd").lacks()
 
 
 @pytest.mark.parametrize("name", KINDS)
