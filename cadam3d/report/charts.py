@@ -56,13 +56,9 @@ def sections(metrics: Lines, charts: Sequence[Chart]) -> dict[str, list[DrawnCha
     where the densifier logs, and then in the steps, where the objective does.
     """
     steps, refinements = lines_of(metrics)
-    last = _last_step(metrics)
+    last = max((number(line.get("step")) or 0 for line in metrics), default=0) or 1
     growth = [
-        draw(
-            GAUSSIANS,
-            [dict(zip(("step", "num_gaussians"), point, strict=True)) for point in counts(metrics)],
-            last,
-        ),
+        draw(GAUSSIANS, [{"step": step, "num_gaussians": count} for step, count in counts(metrics)], last),
         draw(LOSS, steps, last),
         draw(REFINEMENTS, refinements, last),
         draw(RESETS, [line for line in refinements if line.get("reset")], last),
@@ -72,14 +68,17 @@ def sections(metrics: Lines, charts: Sequence[Chart]) -> dict[str, list[DrawnCha
         draw(chart, steps, last) for chart, drawn in zip(charts, by_densifier, strict=True) if drawn is None
     ]
     found = {"Growth": growth, "Densifier": by_densifier, "Objective": by_objective}
-    filled = {title: [each for each in drawn if each is not None] for title, drawn in found.items()}
-    return {title: drawn for title, drawn in filled.items() if drawn}
+    return {title: [each for each in drawn if each] for title, drawn in found.items() if any(drawn)}
 
 
 def lines_of(metrics: Lines) -> tuple[list[Mapping[str, Any]], list[Mapping[str, Any]]]:
     """Return the lines of steps and those of refinements, with their statistics beside their counts."""
     steps = [line for line in metrics if line.get("kind") == "step"]
-    return steps, [_flat(line) for line in metrics if line.get("kind") == "refine"]
+    refinements = [line for line in metrics if line.get("kind") == "refine"]
+    return steps, [
+        {key: value for key, value in line.items() if key != "statistics"} | (line.get("statistics") or {})
+        for line in refinements
+    ]
 
 
 def counts(metrics: Lines) -> list[Point]:
@@ -98,7 +97,7 @@ def draw(chart: Chart, lines: Lines, last_step: float) -> DrawnChart | None:
     factor = 100 if chart.percent else 1
     points = {
         key: [(step, factor * value) for step, value in _points(lines, key) if value > 0 or not chart.log_y]
-        for key in _keys(chart)
+        for key in (*(curve.key for curve in chart.curves), *(chart.band or ()))
     }
     if not any(points.values()):
         return None
@@ -108,38 +107,34 @@ def draw(chart: Chart, lines: Lines, last_step: float) -> DrawnChart | None:
             (LEFT / WIDTH, BOTTOM / HEIGHT, 1 - (LEFT + RIGHT) / WIDTH, 1 - (TOP + BOTTOM) / HEIGHT)
         )
         axes.set_yscale("log" if chart.log_y else "linear")
-        legend = [_draw_curve(axes, curve, color, points[curve.key]) for curve, color in _colored(chart)]
-        if chart.band is not None and (shared := [dict(points[key]) for key in chart.band]) and all(shared):
-            low, high = shared
+        legend = [
+            _draw_curve(axes, curve, color, points[curve.key])
+            for curve, color in _colored(chart)
+            if points[curve.key]
+        ]
+        if chart.band is not None and all(points[key] for key in chart.band):
+            low, high = (dict(points[key]) for key in chart.band)
             steps = sorted(low.keys() & high.keys())
-            color = SERIES_COLORS[0]
-            axes.fill_between(
-                steps, [low[x] for x in steps], [high[x] for x in steps], color=color, alpha=0.18, lw=0
-            )
+            ends = [low[step] for step in steps], [high[step] for step in steps]
+            axes.fill_between(steps, *ends, color=SERIES_COLORS[0], alpha=0.18, lw=0)
             legend.append((chart.band_label or "range", "area", 1))
         axes.set_xlim(0, last_step)
         if not chart.log_y:
             axes.set_ylim(min(0.0, axes.get_ylim()[0]), max(0.0, axes.get_ylim()[1]))
         _finish(axes, "%" if chart.percent else "")
         svg = inline(svg_of(figure, chart.title, DPI))
-    entries = [entry for entry in legend if entry is not None]
-    return DrawnChart(chart.title, chart.caption, entries if len(entries) > 1 else [], svg)
+    return DrawnChart(chart.title, chart.caption, legend if len(legend) > 1 else [], svg)
 
 
 def _colored(chart: Chart) -> list[tuple[Curve, int]]:
     """Return the curves with the numbers of their colours; the last colour is that of thresholds."""
     others = [curve for curve in chart.curves if not curve.is_threshold]
-    colors = len(SERIES_COLORS) - any(curve.is_threshold for curve in chart.curves)
-    return [
-        (curve, THRESHOLD_COLOR if curve.is_threshold else 1 + others.index(curve) % colors)
-        for curve in chart.curves
-    ]
+    colors = {curve: 1 + i % (THRESHOLD_COLOR - 1) for i, curve in enumerate(others)}
+    return [(curve, colors.get(curve, THRESHOLD_COLOR)) for curve in chart.curves]
 
 
-def _draw_curve(axes: Axes, curve: Curve, color: int, points: Sequence[Point]) -> tuple[str, str, int] | None:
-    """Draw a curve and return its entry in the legend; None if it has no points."""
-    if not points:
-        return None
+def _draw_curve(axes: Axes, curve: Curve, color: int, points: Sequence[Point]) -> tuple[str, str, int]:
+    """Draw a curve that has points, and return its entry in the legend."""
     axes.plot(
         *zip(*points, strict=True),
         color=SERIES_COLORS[color - 1],
@@ -163,22 +158,6 @@ def _finish(axes: Axes, unit: str) -> None:
     axes.text(*place, "step", transform=axes.figure.transFigure, ha="right", color=SOFT)
 
 
-def _last_step(metrics: Lines) -> float:
-    """Return the last step, or 1 if none was logged, so that no axis is empty."""
-    return max((number(line.get("step")) or 0 for line in metrics), default=0) or 1
-
-
-def _keys(chart: Chart) -> list[str]:
-    return [*(curve.key for curve in chart.curves), *(chart.band or ())]
-
-
 def _points(lines: Lines, key: str) -> list[Point]:
     pairs = ((number(line.get("step")), number(line.get(key))) for line in lines)
     return [(step, value) for step, value in pairs if step is not None and value is not None]
-
-
-def _flat(line: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the line of a refinement with the densifier's statistics on the same level as the counts."""
-    statistics = line.get("statistics")
-    rest = {key: value for key, value in line.items() if key != "statistics"}
-    return {**rest, **statistics} if isinstance(statistics, Mapping) else rest

@@ -7,14 +7,14 @@ prompts.
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import binomtest, bootstrap, ttest_1samp
 
 from cadam3d.core.number import Number
-from cadam3d.report.results import NOISE, PROMPT, SEED, ArmSetting, Cell, JobResult, arms_of, measured
+from cadam3d.report.results import NOISE, PROMPT, ArmSetting, Cell, JobResult, arms_of, measured
 
 RESAMPLES = 2000
 CONFIDENCE = 0.95
@@ -42,7 +42,10 @@ class Estimate:
     @classmethod
     def of(cls, values: Mapping[Cell, float]) -> "Estimate":
         """Return the estimate from one value per cell, of which there must be at least one."""
-        groups = list(_grouped(values, lambda cell: cell[PROMPT]).values())
+        by_prompt: dict[str, list[float]] = defaultdict(list)
+        for cell, value in sorted(values.items()):  # a fixed order makes the bootstrap reproducible
+            by_prompt[cell[PROMPT]].append(value)
+        groups = list(by_prompt.values())
         low, high = _interval(groups) if len(groups) >= LEAST_FOR_INTERVAL else (None, None)
         middles = [float(np.median(group)) for group in groups]
         ups, downs = sum(middle > 0 for middle in middles), sum(middle < 0 for middle in middles)
@@ -62,14 +65,9 @@ def _interval(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
     values = np.full((len(groups), max(map(len, groups))), np.nan)
     for line, group in zip(values, groups, strict=True):
         line[: len(group)] = group
-
-    def median(drawn: np.ndarray, axis: int = -1) -> np.ndarray:
-        assert axis == -1
-        return np.nanmedian(values[drawn].reshape(*drawn.shape[:-1], -1), axis=-1)
-
     found = bootstrap(
         (np.arange(len(groups)),),
-        median,
+        lambda drawn, axis: np.nanmedian(values[drawn].reshape(*drawn.shape[:-1], -1), axis=axis),
         n_resamples=RESAMPLES,
         confidence_level=CONFIDENCE,
         method="percentile",
@@ -96,18 +94,18 @@ def mean(values: Mapping[str, float]) -> Mean | None:
 
 
 def change(ours: Mapping[str, float], theirs: Mapping[str, float]) -> Mean | None:
-    """Return the mean of ``ours`` over the mean of ``theirs``, minus 1, over the prompts that both have.
+    """Return by how many percent the mean of ``ours`` exceeds that of ``theirs``; both have the same prompts.
 
     The interval is that of the ratio of two paired means by linearisation: the mean of ``ours - ratio *
-    theirs`` is 0, and its interval is divided by the mean of ``theirs``. None without a prompt that both
-    have, and if the mean of ``theirs`` is 0.
+    theirs`` is 0, and its interval is divided by the mean of ``theirs``. None without a prompt, and if the
+    mean of ``theirs`` is 0.
     """
-    both = sorted(ours.keys() & theirs.keys())
-    if not both or not (base := float(np.mean([theirs[prompt] for prompt in both]))):
+    base = sum(theirs.values()) / len(theirs) if theirs else 0.0
+    if not base:
         return None
-    ratio = float(np.mean([ours[prompt] for prompt in both])) / base
-    half = _half([ours[prompt] - ratio * theirs[prompt] for prompt in both])
-    return Mean(ratio - 1, None if half is None else half / abs(base), len(both))
+    ratio = sum(ours.values()) / len(ours) / base
+    half = _half([ours[prompt] - ratio * theirs[prompt] for prompt in sorted(ours)])
+    return Mean(100 * (ratio - 1), None if half is None else 100 * half / abs(base), len(ours))
 
 
 def _half(values: Sequence[float]) -> float | None:
@@ -135,9 +133,7 @@ class PairedComparison:
     @property
     def count(self) -> Estimate:
         """Return by how many percent our count exceeds theirs; -90 means that a tenth of theirs remains."""
-        return Estimate.of(
-            {ours.cell: 100 * ((ours.count or 0) / (theirs.count or 1) - 1) for ours, theirs in self.pairs}
-        )
+        return Estimate.of({ours.cell: 100 * (ours.count / theirs.count - 1) for ours, theirs in self.pairs})
 
     @property
     def early(self) -> int:
@@ -175,7 +171,7 @@ def main_setting(results: Sequence[JobResult], arm: str) -> ArmSetting:
         return shipped[0]
     counts: dict[ArmSetting, list[float]] = defaultdict(list)
     for result in own:
-        counts[result.setting].append(result.count or 0)
+        counts[result.setting].append(result.count)
     ordered = sorted(counts, key=lambda setting: float(np.median(counts[setting])))
     return ordered[(len(ordered) - 1) // 2]
 
@@ -198,9 +194,8 @@ def arms_without_growth(results: Iterable[JobResult]) -> list[str]:
 
 def qualities(results: Iterable[JobResult]) -> list[Number]:
     """Return the numbers by which assets may be chosen, the most preferred one first."""
-    known = {number.name: number for result in measured(results) for number in result.declared.values()}
-    named = {name for result in measured(results) for name in result.numbers}
-    preferred = [each for each in known.values() if each.preference is not None and each.name in named]
+    found = {name: result.declared[name] for result in measured(results) for name in result.numbers}
+    preferred = [each for each in found.values() if each.preference is not None]
     return sorted(preferred, key=lambda each: (each.preference, each.name))
 
 
@@ -262,7 +257,6 @@ class FrontierPoint:
 
     setting: ArmSetting
     is_standard: bool
-    cells: int
     early: int  # cells whose job stopped before its last step
     count: Spread
     gain: Spread  # of the quality
@@ -276,20 +270,16 @@ def frontier(results: Sequence[JobResult], arm: str, gain: Value) -> list[Fronti
     """
     points = []
     for setting in settings_of(results, arm):
-        members = [
-            (result, result.count, found)
-            for result in by_cell(results, setting).values()
-            if result.count and (found := gain(result)) is not None
-        ]
-        if members:
+        members = [(each, gain(each)) for each in by_cell(results, setting).values()]
+        known = [(each, found) for each, found in members if found is not None]
+        if known:
             points.append(
                 FrontierPoint(
                     setting=setting,
-                    is_standard=any(result.is_standard for result, _, _ in members),
-                    cells=len(members),
-                    early=sum(result.ended_early for result, _, _ in members),
-                    count=Spread.of(count for _, count, _ in members),
-                    gain=Spread.of(found for _, _, found in members),
+                    is_standard=any(each.is_standard for each, _ in known),
+                    early=sum(each.ended_early for each, _ in known),
+                    count=Spread.of(each.count for each, _ in known),
+                    gain=Spread.of(found for _, found in known),
                 )
             )
     return sorted(points, key=lambda point: point.count.median)
@@ -307,7 +297,7 @@ def hull_of(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
     best[max(best)] = max(best.values())
     corners: list[tuple[float, float]] = []
     for point in sorted(best.items()):
-        while len(corners) >= 2 and _turns_left(corners[-2], corners[-1], point):
+        while len(corners) >= 2 and _slope(corners[-2], corners[-1]) <= _slope(corners[-1], point):
             corners.pop()
         corners.append(point)
     return corners
@@ -319,9 +309,8 @@ def quality_at(corners: Sequence[tuple[float, float]], count: float) -> float | 
     return float(np.interp(x, xs, ys)) if xs[0] - 1e-12 <= x <= xs[-1] + 1e-12 else None
 
 
-def _turns_left(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
-    """Return whether ``b`` is on or below the line from ``a`` to ``c``."""
-    return (b[0] - a[0]) * (c[1] - a[1]) >= (c[0] - a[0]) * (b[1] - a[1])
+def _slope(a: tuple[float, float], b: tuple[float, float]) -> float:
+    return (b[1] - a[1]) / (b[0] - a[0])
 
 
 def above_frontier(
@@ -332,34 +321,14 @@ def above_frontier(
     The other arm may choose its setting in each cell separately. Cells in which the setting has fewer or more
     Gaussians than all settings of the other arm are left out, because nothing is extrapolated.
     """
-    hulls: dict[Cell, list[tuple[float, float]]] = defaultdict(list)
+    places: dict[Cell, list[tuple[float, float]]] = defaultdict(list)
     for result in measured(results):
-        if result.arm == arm and result.count and (quality := value(result)) is not None:
-            hulls[result.cell].append((result.count, quality))
+        if result.arm == arm and (quality := value(result)) is not None:
+            places[result.cell].append((result.count, quality))
     found = {}
     for cell, result in by_cell(results, setting).items():
         quality = value(result)
-        if cell in hulls and quality is not None and result.count:
-            best = quality_at(hull_of(hulls[cell]), result.count)
-            if best is not None:
-                found[cell] = quality - best
+        best = quality_at(hull_of(places[cell]), result.count) if cell in places else None
+        if quality is not None and best is not None:
+            found[cell] = quality - best
     return found
-
-
-def over_seeds(values: Mapping[Cell, float]) -> float | None:
-    """Return the standard deviation over seeds, averaged over cells that differ in nothing else.
-
-    ``None`` if no such group has two seeds.
-    """
-    groups = [group for group in _grouped(values, lambda cell: cell.without(SEED)).values() if len(group) > 1]
-    return float(np.mean([np.std(group, ddof=1) for group in groups])) if groups else None
-
-
-def _grouped(
-    values: Mapping[Cell, float], group_of: Callable[[Cell], Hashable]
-) -> dict[Hashable, list[float]]:
-    """Return the values of the cells of each group, in a fixed order, so that a bootstrap is reproducible."""
-    groups: dict[Hashable, list[float]] = defaultdict(list)
-    for cell, value in sorted(values.items()):
-        groups[group_of(cell)].append(value)
-    return dict(groups)

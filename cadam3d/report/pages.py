@@ -13,54 +13,34 @@ from cadam3d.io.html import fill
 from cadam3d.report.formatting import show
 
 TEMPLATES = Path(__file__).with_name("templates")
-GOOD, BAD = ("finished",), ("failed", "vanished")  # the other outcomes stopped early with an asset
-# What the templates call.
-FUNCTIONS: dict[str, Any] = {"show": show, "zip": zip, "link": lambda path: quote(str(path))}
-
-
-@dataclass(frozen=True)
-class Tile:
-    """A number in large print, with a label above and a remark below."""
-
-    label: str
-    value: str
-    remark: str
-
-
-@dataclass(frozen=True)
-class Column:
-    """The head of a column of a table."""
-
-    title: str
-    is_text: bool  # aligned to the left
-    is_link: bool  # the cells are names of folders, each with a report
+MOODS = {"finished": "good", "failed": "bad", "vanished": "bad"}  # the others stopped early with an asset
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table, ready to be shown: every cell is text."""
+    """A table, ready to be shown: every cell is text. Columns of text are aligned to the left."""
 
-    columns: list[Column]
+    titles: list[str]
+    is_text: list[bool]
     lines: list[list[str]]
 
 
-def table(lines: Sequence[Mapping[str, Any]], *, link: str = "", align_decimals: bool = False) -> Table:
+def table(lines: Sequence[Mapping[str, Any]], *, align_decimals: bool = False) -> Table:
     """Return a table with one column per key of ``lines``.
 
-    The cells of column ``link`` become links to the reports of jobs. With ``align_decimals`` all numbers of a
-    column have as many decimals as the one that has most.
+    With ``align_decimals`` all numbers of a column have as many decimals as the one that has most.
     """
     keys = list(dict.fromkeys(key for line in lines for key in line))
-    digits = {key: max((_decimals(line.get(key)) for line in lines), default=0) for key in keys}
-    columns = [
-        Column(title=key, is_text=any(_is_text(line.get(key)) for line in lines), is_link=key == link)
-        for key in keys
-    ]
-    cells = [
-        [_cell(line.get(key), digits[key]) if align_decimals else show(line.get(key)) for key in keys]
-        for line in lines
-    ]
-    return Table(columns, cells)
+    columns = [[line.get(key) for line in lines] for key in keys]
+    # An estimate is text that begins with a sign.
+    is_text = [any(isinstance(cell, str) and cell[:1] not in ("+", "-") for cell in each) for each in columns]
+    shown = [_aligned(each) if align_decimals else list(map(show, each)) for each in columns]
+    return Table(keys, is_text, [list(line) for line in zip(*shown, strict=True)])
+
+
+def _aligned(column: Sequence[Any]) -> list[str]:
+    digits = max(len(repr(value).partition(".")[2]) if isinstance(value, float) else 0 for value in column)
+    return [f"{value:,.{digits}f}" if type(value) in (int, float) else show(value) for value in column]
 
 
 def write_page(path: Path, template: str, **content: Any) -> Path:
@@ -68,8 +48,9 @@ def write_page(path: Path, template: str, **content: Any) -> Path:
 
     Raises ``UserError`` if the file cannot be written.
     """
+    functions = {"show": show, "link": lambda path: quote(str(path)), "mood": mood}
     text = fill(
-        TEMPLATES / template, version=__version__, color_variables=css(), mood=mood, **FUNCTIONS, **content
+        TEMPLATES / template, version=__version__, color_variables=css(), zip=zip, **functions, **content
     )
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -78,18 +59,4 @@ def write_page(path: Path, template: str, **content: Any) -> Path:
 
 def mood(outcome: str) -> str:
     """Return the CSS class for the outcome of a run: ``good``, ``warn`` or ``bad``."""
-    return "good" if outcome in GOOD else "bad" if outcome in BAD else "warn"
-
-
-def _cell(value: Any, digits: int) -> str:
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return f"{value:,.{digits}f}" if is_number else show(value)
-
-
-def _is_text(value: Any) -> bool:
-    # An estimate is text that begins with a sign.
-    return isinstance(value, str) and value[:1] not in ("+", "-")
-
-
-def _decimals(value: Any) -> int:
-    return len(repr(value).partition(".")[2]) if isinstance(value, float) else 0
+    return MOODS.get(outcome, "warn")

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -32,26 +33,16 @@ LATEX = {
 
 def headings(table: PaperTable) -> list[str]:
     """Return the titles of all columns, with an arrow towards the better numbers."""
-    titles = [f"{each.heading} {ARROWS[each.is_more_better]}".strip() for each in table.numbers]
-    return [*_first(table), *titles]
+    return [*FIRST, *(f"{each.heading} {ARROWS[each.is_more_better]}".strip() for each in table.numbers)]
 
 
 def texts(table: PaperTable) -> list[list[str]]:
     """Return the text of every cell of every row, for readers."""
-    return [
-        [_beginning(row)[name] for name in _first(table)] + [text(cell, row) for cell in row.cells]
-        for row in table.rows
-    ]
+    return [[*_beginning(row), *(text(cell, row) for cell in row.cells)] for row in table.rows]
 
 
-def _first(table: PaperTable) -> list[str]:
-    """Return the titles of the columns before the numbers; without categories there is no column of them."""
-    return [name for name in FIRST if name != "category" or any(row.category for row in table.rows)]
-
-
-def _beginning(row: TableRow) -> dict[str, str]:
-    values = (row.category or ALL, row.objective, row.method, row.source, row.prompts)
-    return dict(zip(FIRST, values, strict=True))
+def _beginning(row: TableRow) -> tuple[str, ...]:
+    return row.category or ALL, row.objective, row.method, row.source, row.prompts
 
 
 def text(cell: TableCell, row: TableRow) -> str:
@@ -63,9 +54,14 @@ def text(cell: TableCell, row: TableRow) -> str:
 
 def markdown(table: PaperTable) -> str:
     """Return the table as Markdown, with its notes as a list."""
-    rule = [*["---"] * len(_first(table)), *["---:"] * len(table.numbers)]
+    rule = [*["---"] * len(FIRST), *["---:"] * len(table.numbers)]
     rows = [_markdown_line(headings(table)), f"| {' | '.join(rule)} |", *map(_markdown_line, texts(table))]
-    return "\n".join([*rows, "", *(f"- {' '.join(note.split())}" for note in table.notes)]) + "\n"
+    return "\n".join([*rows, "", *(f"- {note}" for note in table.notes)]) + "\n"
+
+
+def _markdown_line(cells: Sequence[str]) -> str:
+    escaped = (re.sub(r"([\\|*_`<\[])", r"\\\1", " ".join(cell.split())) for cell in cells)
+    return f"| {' | '.join(escaped)} |"
 
 
 def comma_separated(table: PaperTable) -> str:
@@ -78,47 +74,35 @@ def comma_separated(table: PaperTable) -> str:
     )
     for row in table.rows:
         numbers = [
-            entry for cell in row.cells for entry in (_plain(cell.text), _plain(cell.half), cell.prompts)
+            entry
+            for cell in row.cells
+            for entry in (cell.text.replace(",", ""), cell.half.replace(",", ""), cell.prompts)
         ]
-        writer.writerow([*_beginning(row).values(), *numbers])
+        writer.writerow([*_beginning(row), *numbers])
     return file.getvalue()
-
-
-def _plain(number: str) -> str:
-    """Return a number without separators of thousands."""
-    return number.replace(",", "")
 
 
 def latex(table: PaperTable) -> str:
     """Return the table as LaTeX that needs no package, with a line above each objective."""
     lines = [r"\begin{table}", r"\centering"]
-    lines += [rf"\begin{{tabular}}{{{'l' * len(_first(table))}{'r' * len(table.numbers)}}}", r"\hline"]
+    lines += [rf"\begin{{tabular}}{{{'l' * len(FIRST)}{'r' * len(table.numbers)}}}", r"\hline"]
     lines += [_latex_line(headings(table))]
     before = None
     for row, cells in zip(table.rows, texts(table), strict=True):
         lines += [r"\hline"] if before != (row.category, row.objective) else []
         before = (row.category, row.objective)
         lines.append(_latex_line(cells))
-    notes = [f"% {' '.join(note.split())}" for note in table.notes]
+    notes = [f"% {note}" for note in table.notes]
     return "\n".join([*lines, r"\hline", r"\end{tabular}", r"\end{table}", *notes]) + "\n"
 
 
 def in_latex(plain: str) -> str:
     """Return a text in which no character has a meaning in LaTeX."""
-    return "".join(LATEX.get(character, character) for character in " ".join(plain.split()))
+    return " ".join(plain.split()).translate(str.maketrans(LATEX))
 
 
 def _latex_line(cells: Sequence[str]) -> str:
     return " & ".join(map(in_latex, cells)) + r" \\"
-
-
-def _markdown_line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(map(_in_markdown, cells))} |"
-
-
-def _in_markdown(plain: str) -> str:
-    line = " ".join(plain.split())
-    return "".join(f"\\{character}" if character in r"\|*_`<[" else character for character in line)
 
 
 FORMATS = {PAPER_TABLE_MARKDOWN: markdown, PAPER_TABLE_CSV: comma_separated, PAPER_TABLE_LATEX: latex}
@@ -126,7 +110,7 @@ FORMATS = {PAPER_TABLE_MARKDOWN: markdown, PAPER_TABLE_CSV: comma_separated, PAP
 
 def read_table(sweep: Path) -> PaperTable | None:
     """Return the table of a sweep; None if its grid does not ask for it or no job has left an asset."""
-    return paper_table(read(sweep), sweep) if read_plan(sweep).paper_table else None
+    return paper_table(read(sweep)) if read_plan(sweep).paper_table else None
 
 
 def write(sweep: Path) -> str:
@@ -136,9 +120,6 @@ def write(sweep: Path) -> str:
     """
     table = read_table(sweep)
     if table is None:
-        # Files that an earlier line wrote would be mistaken for the table of the present jobs.
-        for name in FORMATS:
-            (sweep / name).unlink(missing_ok=True)
         return ""
     for name, write_as in FORMATS.items():
         with replacing(sweep / name) as temporary:

@@ -31,11 +31,6 @@ class PublishedRow:
     arm: str
     texts: Mapping[str, str]  # by the name of a number
 
-    def number(self, name: str) -> float | None:
-        """Return a printed number without its unit; None if the row does not have it."""
-        text = self.texts.get(name)
-        return None if text is None else float(text.removesuffix("MB").removesuffix("K"))
-
 
 def _row(objective: str, recipe: str, arm: str, line: str) -> PublishedRow:
     names = [each.name for each in (*SCORES, *SIZES)]

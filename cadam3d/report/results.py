@@ -20,12 +20,10 @@ from cadam3d.io.records import (
     Score,
     declared,
     latest_scores,
-    read_config,
     read_evaluation,
     read_histograms,
     read_quality,
 )
-from cadam3d.io.run_folder import CONFIG
 from cadam3d.report.formatting import number
 from cadam3d.settings.compose import compose, flatten
 from cadam3d.settings.options import option_names
@@ -35,7 +33,6 @@ from cadam3d.sweep.folder import UNFINISHED, Row, load
 WITH_ASSET = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.OUT_OF_MEMORY)
 ARM, PREFIX = "densifier", "densifier."
 SEED, PROMPT, NOISE, GUIDANCE, RECIPE = "seed", "prompt", "noise", "guidance", "experiment"
-NO_NOISE = "none"  # the level whose gradients have no noise
 
 
 @dataclass(frozen=True)
@@ -48,12 +45,8 @@ class ArmSetting:
     @property
     def name(self) -> str:
         """Return a name such as ``cadam`` or ``baseline (tau_pos 0.001)``."""
-        return f"{self.arm} ({self.short})" if self.thresholds else self.arm
-
-    @property
-    def short(self) -> str:
-        """Return the thresholds without the arm; empty if there are none."""
-        return ", ".join(f"{key} {_written(value)}" for key, value in self.thresholds)
+        listed = ", ".join(f"{key} {_written(value)}" for key, value in self.thresholds)
+        return f"{self.arm} ({listed})" if listed else self.arm
 
     @property
     def values(self) -> str:
@@ -108,14 +101,14 @@ class JobResult:
         return self.setting.arm
 
     @property
-    def count(self) -> float | None:
-        """Return the number of Gaussians at the end."""
-        return self.numbers.get(COUNT.name)
+    def count(self) -> float:
+        """Return the number of Gaussians at the end; 0 if it is unknown."""
+        return self.numbers.get(COUNT.name, 0.0)
 
     @property
     def is_measured(self) -> bool:
         """Return whether the job left an asset that may be compared."""
-        return self.outcome in WITH_ASSET and bool(self.count)
+        return self.outcome in WITH_ASSET and self.count > 0
 
     @property
     def is_unfinished(self) -> bool:
@@ -242,12 +235,6 @@ def histograms(result: JobResult, score: str | None = None) -> list[dict[str, An
     return [line for line in lines if line.get("score") == score]
 
 
-def config(result: JobResult) -> dict[str, Any]:
-    """Return all settings that a job ran with; {} if it failed before they were known."""
-    path = result.folder / CONFIG
-    return read_config(path) if path.is_file() else {}
-
-
 def arms_of(results: Iterable[JobResult]) -> list[str]:
     """Return the arms that left something to measure, in the order of the sweep."""
     return list(dict.fromkeys(result.arm for result in measured(results)))
@@ -260,9 +247,7 @@ def levels_of(results: Iterable[JobResult]) -> list[str]:
 
 def level_title(level: str) -> str:
     """Return the title of a panel for a noise level; empty if the sweep does not vary the noise."""
-    if level == NO_NOISE:
-        return "no noise"
-    return f"{level} noise" if level else ""
+    return f"{'no' if level == 'none' else level} noise" if level else ""
 
 
 def at_noise(results: Iterable[JobResult], level: str) -> list[JobResult]:
@@ -271,13 +256,8 @@ def at_noise(results: Iterable[JobResult], level: str) -> list[JobResult]:
 
 
 def objective_axis(results: Iterable[JobResult]) -> str:
-    """Return the key of the cells that chooses the objective.
-
-    That is ``experiment`` if recipes vary and ``guidance`` does not.
-    """
-    results = list(results)
-    varies = {key: any(result.cell[key] for result in results) for key in (GUIDANCE, RECIPE)}
-    return RECIPE if varies[RECIPE] and not varies[GUIDANCE] else GUIDANCE
+    """Return the key of the cells that chooses the objective: ``guidance`` if it varies."""
+    return GUIDANCE if any(result.cell[GUIDANCE] for result in results) else RECIPE
 
 
 def measured(results: Iterable[JobResult]) -> list[JobResult]:

@@ -5,17 +5,22 @@ from pathlib import Path
 from typing import Any
 
 from cadam3d.core.chart import Chart
+from cadam3d.core.errors import UserError
 from cadam3d.io.declarations import write_declarations
-from cadam3d.io.html import data_url, source
+from cadam3d.io.html import data_url, encoded, source
+from cadam3d.io.ply import read_ply
+from cadam3d.io.reading import read_bytes
 from cadam3d.io.records import MEASUREMENTS, NUMBERS, declared
-from cadam3d.io.run_folder import ASSET, CONFIG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE
+from cadam3d.io.run_folder import ASSET, CONFIG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE, snapshots
 from cadam3d.report.charts import lines_of, sections
-from cadam3d.report.formatting import elapsed, number, shown_bytes
-from cadam3d.report.growth import frames
-from cadam3d.report.pages import TEMPLATES, Tile, table, write_page
+from cadam3d.report.formatting import elapsed, number
+from cadam3d.report.pages import TEMPLATES, table, write_page
+from cadam3d.viewer.pack import pack
 from cadam3d.viewer.page import script, style
 
-EMBED_BYTES = 8 << 20  # a larger video is linked, not embedded
+MIB = 1 << 20
+EMBED_BYTES = 8 * MIB  # a larger video is linked, not embedded
+LARGEST = 8 * MIB  # of all snapshots in a page; base64 makes a third more of them
 FILES = (ASSET, TURNTABLE, PREVIEW, SUMMARY, METRICS, CONFIG)
 HIDDEN = ("warnings", MEASUREMENTS, NUMBERS)  # entries of the summary that are no facts
 COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "device")
@@ -79,24 +84,45 @@ def write(
     )
 
 
-def _tiles(summary: Mapping[str, Any]) -> list[Tile]:
-    """Return the numbers that matter most, as far as they are known."""
+def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Return the numbers that matter most, as far as they are known: a label, a value and a remark."""
     found = {name: value for name in summary if (value := number(summary[name])) is not None}
     tiles = []
     if (count := found.get("num_gaussians")) is not None:
         initial = found.get("num_gaussians_initial")
-        tiles.append(Tile("Gaussians", f"{count:,.0f}", "" if initial is None else f"from {initial:,.0f}"))
-    preferred = [
-        each for each in declared(summary).values() if each.preference is not None and each.name in found
-    ]
+        tiles.append(("Gaussians", f"{count:,.0f}", "" if initial is None else f"from {initial:,.0f}"))
+    known = [each for each in declared(summary).values() if each.name in found]
+    preferred = [each for each in known if each.preference is not None]
     for each in sorted(preferred, key=lambda each: (each.preference, not each.replaces))[:1]:
-        tiles.append(Tile(each.label, each.written(found[each.name]), ""))
+        tiles.append((each.label, each.written(found[each.name]), ""))
     if (size := found.get("asset_bytes")) is not None:
-        tiles.append(Tile(ASSET, shown_bytes(size), ""))
+        tiles.append((ASSET, f"{size / MIB:.2f} MiB", ""))
     if (seconds := found.get("seconds")) is not None:
-        steps = found.get("steps")
-        tiles.append(Tile("Time", elapsed(seconds), f"{steps:,.0f} steps" if steps else ""))
+        tiles.append(("Time", elapsed(seconds), f"{found.get('steps', 0):,.0f} steps"))
     return tiles
+
+
+def frames(folder: Path, steps: int) -> list[tuple[int, str]]:
+    """Return steps and snapshots of the run in ``folder``, in order and in base64, for the 3D view of a page.
+
+    The last one is the object after ``steps`` steps. Together they have at most ``LARGEST`` bytes. If there
+    are more, every second of them is left out, or two of three, and so on, but never the last one. The result
+    is empty if nothing can be read, or if the last one alone is too large.
+    """
+    paths = {step: path for step, path in snapshots(folder).items() if step <= steps}
+    try:
+        found = {step: read_bytes(path, largest=LARGEST) for step, path in paths.items()}
+        if steps not in found:
+            found[steps] = pack(read_ply(folder / ASSET))
+    except UserError:
+        # A file that cannot be read costs the picture, not the report.
+        return []
+    backwards = sorted(found, reverse=True)
+    for stride in range(1, len(backwards) + 1):
+        kept = sorted(backwards[::stride])
+        if sum(len(found[step]) for step in kept) <= LARGEST:
+            return [(step, encoded(found[step])) for step in kept]
+    return []
 
 
 def _video_source(path: Path) -> str:

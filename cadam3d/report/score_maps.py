@@ -28,12 +28,8 @@ LEVEL_COLORS = ("#c85a00", "#111111", "#00805c")
 
 def declared_scores(results: Iterable[JobResult]) -> dict[str, Chart]:
     """Return the charts about a score that any of the jobs declares, by the name of the score."""
-    found: dict[str, Chart] = {}
-    for result in measured(results):
-        for chart in read_declarations(result.folder):
-            if chart.score:
-                found.setdefault(chart.score, chart)
-    return found
+    charts = [chart for result in measured(results) for chart in read_declarations(result.folder)]
+    return {chart.score: chart for chart in reversed(charts) if chart.score}
 
 
 @dataclass(frozen=True)
@@ -56,26 +52,24 @@ class ScoreMap:
         bins = max(line["first"] + len(line["counts"]) for line in lines) - first
         by_step = defaultdict(list)
         for line in lines:
-            share, at = np.zeros(bins), line["first"] - first
-            share[at : at + len(line["counts"])] = np.array(line["counts"]) / sum(line["counts"])
-            by_step[line["step"]].append(share)
+            counts = np.array(line["counts"])
+            before = line["first"] - first
+            after = bins - before - len(counts)
+            by_step[line["step"]].append(np.pad(counts / counts.sum(), (before, after)))
         steps = sorted(by_step)
-        declared = next(
-            (each.levels for each in read_declarations(results[0].folder) if each.score == score), ()
-        )
+        declared = [each for each in read_declarations(results[0].folder) if each.score == score]
         return cls(
             steps=steps,
             edges=10 ** ((first + np.arange(bins + 1)) / lines[0]["bins_per_decade"]),
             shares=np.stack([np.mean(by_step[step], axis=0) for step in steps], axis=1),
-            levels=[level for level in declared if level.value > 0],
+            levels=[level for chart in declared for level in chart.levels if level.value > 0],
         )
 
     @property
-    def shown(self) -> tuple[float, float]:
-        """Return the range of scores worth showing: the filled bins and the levels."""
+    def shown(self) -> list[float]:
+        """Return the scores that an axis must include: the filled bins and the levels."""
         filled = self.edges[:-1][self.shares.max(axis=1) > LEAST_SHARE]
-        values = [*filled, *(level.value for level in self.levels)] or list(self.edges)
-        return float(min(values)), float(max(values))
+        return [*filled.tolist(), *(level.value for level in self.levels)]
 
 
 def score_figure(results: Sequence[JobResult], chart: Chart) -> Figure | None:
@@ -83,13 +77,12 @@ def score_figure(results: Sequence[JobResult], chart: Chart) -> Figure | None:
 
     Arms whose jobs have no such score are left out. ``None`` if none has.
     """
-    maps = {
-        f"{arm}, {level_title(level)}".removesuffix(", "): found
-        for arm in arms_of(results)
-        for level in levels_of(results)
-        for members in [by_cell(at_noise(results, level), main_setting(results, arm))]
-        if (found := ScoreMap.of(list(members.values()), chart.score))
-    }
+    maps: dict[str, ScoreMap] = {}
+    for arm in arms_of(results):
+        for level in levels_of(results):
+            members = by_cell(at_noise(results, level), main_setting(results, arm))
+            if found := ScoreMap.of(list(members.values()), chart.score):
+                maps[f"{arm}, {level_title(level)}".removesuffix(", ")] = found
     if not maps:
         return None
     columns = min(len(maps), MAX_COLUMNS)
@@ -98,14 +91,12 @@ def score_figure(results: Sequence[JobResult], chart: Chart) -> Figure | None:
     panels = figure.subplots(lines, columns, squeeze=False, sharey=True)
     for axes, (title, found) in zip(panels.flat, maps.items(), strict=False):
         axes.set_title(title)
-        axes.set_xlabel("step")
-        axes.set_yscale("log")
         _draw(axes, found)
-    shown = [found.shown for found in maps.values()]
-    panels[0, 0].set_ylim(min(low for low, _ in shown) / 1.5, max(high for _, high in shown) * 2)
+    shown = [value for found in maps.values() for value in found.shown]
+    panels[0, 0].set_ylim(min(shown) / 1.5, max(shown) * 2)
     label_axis(panels[0, 0].yaxis)
-    for axes in panels[:, 0]:
-        axes.set_ylabel(chart.score)
+    figure.supxlabel("step")
+    figure.supylabel(chart.score)
     for axes in panels.flat[len(maps) :]:
         axes.set_visible(False)
     return figure
@@ -114,30 +105,14 @@ def score_figure(results: Sequence[JobResult], chart: Chart) -> Figure | None:
 def _draw(axes: Axes, found: ScoreMap) -> None:
     axes.set_facecolor(BACKGROUND)
     axes.grid(visible=False)
-    half = float(np.diff(found.steps).min() if len(found.steps) > 1 else 10.0) / 2
-    for step, shares in zip(found.steps, found.shares.T, strict=True):
-        axes.pcolormesh(
-            [step - half, step + half],
-            found.edges,
-            np.ma.masked_less_equal(shares[:, None], 0),
-            cmap="Blues",
-            vmin=-0.02,
-            vmax=found.shares.max(),
-            rasterized=True,
-        )
+    axes.set_yscale("log")
+    shares = np.ma.masked_less_equal(found.shares, 0)
+    centres = np.sqrt(found.edges[:-1] * found.edges[1:])
+    axes.pcolormesh(
+        found.steps, centres, shares, cmap="Blues", vmin=-0.02, shading="nearest", rasterized=True
+    )
     for i, level in enumerate(found.levels):
         color = LEVEL_COLORS[i % len(LEVEL_COLORS)]
-        axes.axhline(level.value, color=color, lw=1.1, ls="--")
-        axes.annotate(
-            f"{level.label} {level.value:.3g}",
-            (1, level.value),
-            xycoords=("axes fraction", "data"),
-            # The label of the highest level is above its line, the others are below theirs.
-            xytext=(-3, 8 if level == max(found.levels, key=lambda each: each.value) else -8),
-            textcoords="offset points",
-            ha="right",
-            va="center",
-            fontsize=7.5,
-            color=color,
-            bbox={"facecolor": BACKGROUND, "alpha": 0.85, "lw": 0, "pad": 0.5},
-        )
+        axes.axhline(level.value, color=color, lw=1.1, ls="--", label=f"{level.label} {level.value:.3g}")
+    if found.levels:
+        axes.legend(fontsize=7.5, loc="upper right", frameon=False, labelcolor="linecolor")

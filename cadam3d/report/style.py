@@ -22,7 +22,6 @@ MARKERS = ("o", "s", "D", "^", "X", "P", "v", "<", ">", "p", "*", "d", "h")
 INCH = 2.9  # height of a panel
 LEAST_TEXT = 10.0  # CSS pixels; no text of a figure on a page is smaller, on whatever screen
 TICKS = 6  # at most, on a linear axis
-SHORT_RANGE = 1e3  # a logarithmic axis over less has 1, 2 and 5 times the powers of ten
 # The type is Any, because matplotlib types the names of its settings one by one.
 RC: Any = {
     "font.family": "sans-serif",
@@ -99,7 +98,8 @@ def label_axis(axis: Axis, unit: str = "") -> None:
     """
     if axis.get_scale() == "log":
         low, high = axis.get_view_interval()
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < SHORT_RANGE * low else (1.0,)))
+        # An axis over few decades has 1, 2 and 5 times the powers of ten.
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
         axis.set_minor_locator(NullLocator())
     else:
         axis.set_major_locator(MaxNLocator(TICKS, steps=[1, 2, 5, 10]))
@@ -141,17 +141,12 @@ def inline(svg: str) -> str:
     text = svg[svg.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>", "", text, flags=re.DOTALL)
     least = least_width(text)
-    text = re.sub(
-        r'(<svg[^>]*?) width="([\d.]+)pt"',
-        rf'\1 style="max-width: \2pt; --least: {least:.0f}px"',
-        text,
-        count=1,
-    )
-    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
+    size = r'(<svg[^>]*?) width="([\d.]+)pt" height="[^"]*"'
+    text = re.sub(size, rf'\1 style="max-width: \2pt; --least: {least:.0f}px"', text, count=1)
     text = re.sub(r' xmlns(:\w+)?="[^"]*"| version="1.1"', "", text, count=3)
     text = re.sub(r'<g id="[^"]*"', "<g", text)
     text = re.sub(r" font-family: [^;\"]*;", "", text)
-    text = re.sub(r'(?<= d=")[^"]*', lambda found: _compact(found.group()), text)
+    text = re.sub(r'(?<= d=")[^"]*', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path.group()), text)
     text = re.sub(r">\s+<", "><", text)
     for color, variable in VARIABLES.items():
         text = text.replace(color, f"var(--{variable}, {color})")
@@ -166,8 +161,3 @@ def least_width(svg: str) -> float:
     sizes = [float(size) for size in re.findall(r"font(?:-size)?: (?:[\w ]+ )?([\d.]+)px", svg)]
     width = re.search(r'<svg[^>]*? width="([\d.]+)pt"', svg)
     return float(width.group(1)) * LEAST_TEXT / min(sizes) if sizes and width else 0.0
-
-
-def _compact(path: str) -> str:
-    """Return the data of an SVG path with at most two decimals and without line breaks."""
-    return " ".join(re.sub(r"(\d+\.\d\d)\d+", r"\1", path).split())

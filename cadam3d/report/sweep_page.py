@@ -16,10 +16,10 @@ from cadam3d.io.jsonl import read_json
 from cadam3d.io.run_folder import CHOICE, FIGURES, REPORT, TABLE
 from cadam3d.report import figures, paper_formats, strips, tables
 from cadam3d.report.formatting import plural
-from cadam3d.report.pages import Column, Table, table, write_page
+from cadam3d.report.pages import Table, table, write_page
 from cadam3d.report.paper_formats import FORMATS, read_table
 from cadam3d.report.paper_table import PaperTable
-from cadam3d.report.results import NOISE, PROMPT, SEED, JobResult, measured, read
+from cadam3d.report.results import PROMPT, JobResult, measured, read
 from cadam3d.report.score_maps import declared_scores, score_figure
 from cadam3d.report.style import inline, styled, write_figure
 from cadam3d.settings.line import key_of
@@ -35,22 +35,13 @@ class FigureKind:
     caption: str
 
 
-@dataclass(frozen=True)
-class ShownFigure:
-    """A figure as a part of the page."""
-
-    title: str
-    caption: str
-    svg: str
-
-
 FRONTIER = (
     "Up and to the left is better. Each mark is the median of one setting over cells; an arm with one "
     "threshold has it beside each mark, and the standard setting is ringed. Bars hold the middle half of the "
-    "cells. A hollow mark lacks some cells, and a dagger means that jobs ended early."
+    "cells. A dagger means that jobs ended early."
 )
-# The figures of every sweep. Those of declared scores come after "growth", and a grid may also name
-# "frontier_NAME", the frontier of any other number.
+# The figures of every sweep. A sweep also has those of declared scores, and a grid may name "frontier_NAME",
+# the frontier of any other number.
 KINDS = {
     "frontier": FigureKind(figures.frontier_figure, "Quality against count", FRONTIER),
     "growth": FigureKind(
@@ -84,7 +75,6 @@ KINDS = {
 }
 MOST_PROMPTS = 3  # in the title of a page
 LONGEST_PROMPT = 60  # characters of a prompt there
-SCORES_AFTER = "growth"
 SCORE_CAPTION = "Darker cells hold more Gaussians; the dashed lines are values to compare with."
 
 
@@ -102,75 +92,61 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None, baseline: str 
     if not results:
         raise UserError(f"{sweep_folder}: expected a sweep with jobs, got none. Try: cadam3d sweep --help")
     names = plan.figures if names is None else names
-    kinds = _kinds(results)
-    chosen = list(kinds) if names is None else names
-    kinds |= _frontiers(results)
     folder = sweep_folder / FIGURES
     comparison = tables.comparison_table(results, baseline)
     medians = tables.medians_table(results)
     tables.write_csv(folder / "comparison.csv", comparison)
     tables.write_csv(folder / "medians.csv", medians)
-    drawn = [_drawn(results, name, kinds[name], folder) for name in chosen if name in kinds]
+    kinds = KINDS | _scores(results)
+    chosen = list(kinds) if names is None else names
+    kinds |= _frontiers(results)
+    drawn = [(kinds[name], _drawn(results, name, kinds[name], folder)) for name in chosen if name in kinds]
+    unknown = [name for name in chosen if name not in kinds]
     paper = read_table(sweep_folder)
     return write_page(
         sweep_folder / REPORT,
         "sweep.html.jinja",
         title=_title(plan, results),
         outcomes=Counter(result.outcome for result in results).most_common(),
-        extent=_extent(results),
-        warnings=_unknown(chosen, kinds),
-        choice=_choice(sweep_folder, plan),
+        warnings=[f"figures: expected one of {', '.join(kinds)}, got {name}." for name in unknown],
+        choice=_choice(sweep_folder),
         comparison=table(tables.shown_comparison(comparison, results), align_decimals=True),
         paper_table=_shown(paper),
-        paper_notes=[] if paper is None else paper.notes,
+        notes=paper.notes if paper else (),
         medians=table(medians, align_decimals=True),
-        figures=[figure for figure in drawn if figure is not None],
+        figures=[(kind, svg) for kind, svg in drawn if svg],
         early=[each for each in results if each.outcome != Outcome.FINISHED and not each.is_unfinished],
         waiting=sum(result.is_unfinished for result in results),
-        jobs=table(tables.jobs_table(results), link="job", align_decimals=True),
+        jobs=table(tables.jobs_table(results), align_decimals=True),
         commands=_commands(plan),
         files=[name for name in (TABLE, *FORMATS, FIGURES) if (sweep_folder / name).exists()],
     )
 
 
-def _choice(folder: Path, plan: Plan) -> str:
-    """Return why one of several attempts is the best, if the jobs are attempts and one was chosen."""
-    if plan.command != "train" or not (folder / CHOICE).is_file():
-        return ""
+def _choice(folder: Path) -> str:
+    """Return why one of several attempts is the best; empty if none was chosen."""
     try:
-        content = read_json(folder / CHOICE)
-    except UserError:
+        return str(read_json(folder / CHOICE)["why"])
+    except (UserError, LookupError, TypeError):
         return ""
-    reason = content.get("why") if isinstance(content, dict) else None
-    return reason if isinstance(reason, str) else ""
 
 
 def _shown(found: PaperTable | None) -> Table:
     """Return the paper's table as a part of the page; it is empty if there is none."""
     if found is None:
-        return Table([], [])
+        return Table([], [], [])
     titles = paper_formats.headings(found)
-    texts = len(titles) - len(found.numbers)
-    columns = [Column(title, is_text=i < texts, is_link=False) for i, title in enumerate(titles)]
-    return Table(columns, paper_formats.texts(found))
+    is_text = [True] * len(paper_formats.FIRST) + [False] * len(found.numbers)
+    return Table(titles, is_text, paper_formats.texts(found))
 
 
-def _kinds(results: Sequence[JobResult]) -> dict[str, FigureKind]:
-    """Return all figures that these results can have, in the order of the page."""
-    kinds: dict[str, FigureKind] = {}
-    for name, kind in KINDS.items():
-        kinds[name] = kind
-        if name == SCORES_AFTER:
-            kinds |= {
-                score: FigureKind(
-                    partial(score_figure, chart=chart),
-                    chart.title,
-                    f"{chart.caption.rstrip('.')}. {SCORE_CAPTION}",
-                )
-                for score, chart in declared_scores(results).items()
-                if score not in KINDS
-            }
-    return kinds
+def _scores(results: Sequence[JobResult]) -> dict[str, FigureKind]:
+    """Return the figures of the scores that the jobs declare."""
+    return {
+        score: FigureKind(partial(score_figure, chart=chart), chart.title, f"{chart.caption} {SCORE_CAPTION}")
+        for score, chart in declared_scores(results).items()
+        if score not in KINDS
+    }
 
 
 def _frontiers(results: Sequence[JobResult]) -> dict[str, FigureKind]:
@@ -178,52 +154,30 @@ def _frontiers(results: Sequence[JobResult]) -> dict[str, FigureKind]:
 
     A number that replaces another one, such as the PSNR at the best turn, is drawn under the other's name.
     """
-    numbers = {each.name: each for result in measured(results) for each in result.declared.values()}
+    numbers = [result.declared[name] for result in measured(results) for name in result.numbers]
     return {
         f"frontier_{each.replaces or each.name}": FigureKind(
             partial(figures.frontier_figure, quality=each), f"{each.fact} against count", FRONTIER
         )
-        for each in numbers.values()
-        if any(each.name in result.numbers for result in results)
+        for each in numbers
     }
 
 
-def _unknown(names: Sequence[str], kinds: dict[str, FigureKind]) -> list[str]:
-    """Return a remark for each figure that does not exist, or not yet: a score may still be declared."""
-    return [
-        f"figures: no figure is called {name}. The figures of this sweep are {', '.join(kinds)}."
-        for name in names
-        if name not in kinds
-    ]
-
-
-def _drawn(results: Sequence[JobResult], name: str, kind: FigureKind, folder: Path) -> ShownFigure | None:
+def _drawn(results: Sequence[JobResult], name: str, kind: FigureKind, folder: Path) -> str:
+    """Return a figure as a part of the page, and write its files; empty if there are no data for it."""
     with styled():
         figure = kind.draw(results)
-        if figure is None:
-            return None
-        return ShownFigure(kind.title, kind.caption, inline(write_figure(figure, folder, name)))
+        return inline(write_figure(figure, folder, name)) if figure else ""
 
 
 def _title(plan: Plan, results: Sequence[JobResult]) -> str:
     """Return the name of the grid, if there is one, and the prompts."""
     grids = [str(word).partition("=")[2].strip("'\"") for word in plan.line if key_of(str(word)) == "grid"]
-    name = next((grid for grid in grids if grid not in ("", "null")), "Sweep")
-    if plan.command == "train":
-        name = plural(len(results), "attempt")
+    name = next(filter(None, grids), "Sweep") if plan.command == "sweep" else plural(len(results), "attempt")
     prompts = list(filter(None, dict.fromkeys(result.cell[PROMPT] for result in results)))
     shown = [shorten(text, LONGEST_PROMPT, placeholder=" ...") for text in prompts[:MOST_PROMPTS]]
     more = f" and {len(prompts) - len(shown)} more" if len(prompts) > len(shown) else ""
     return f"{name}: {', '.join(shown)}{more}" if shown else name
-
-
-def _extent(results: Sequence[JobResult]) -> list[str]:
-    """Return how many prompts, seeds, noise levels and settings there are."""
-    texts = []
-    for key, noun in ((PROMPT, "prompt"), (SEED, "seed"), (NOISE, "noise level")):
-        if values := {result.cell[key] for result in results if result.cell[key]}:
-            texts.append(plural(len(values), noun))
-    return [*texts, plural(len({result.setting for result in results}), "setting")]
 
 
 def _commands(plan: Plan) -> str:

@@ -12,11 +12,11 @@ from cadam3d.io.atomic import replacing
 from cadam3d.report.compare import (
     Estimate,
     above_frontier,
+    arms_without_growth,
     by_cell,
     compare,
     gain_over,
     main_setting,
-    over_seeds,
     qualities,
     references,
     settings_of,
@@ -56,9 +56,8 @@ def comparison_table(results: Sequence[JobResult], baseline: str | None = None) 
 
 def _difference(results: Sequence[JobResult], setting: ArmSetting, arm: str) -> Line | None:
     """Return how a setting differs from the main setting of an arm; None if no cell has both."""
-    if not settings_of(results, arm):
-        return None
-    found = compare(results, setting, main_setting(results, arm))
+    settings = settings_of(results, arm)
+    found = compare(results, setting, main_setting(results, arm)) if settings else None
     if found is None:
         return None
     line: Line = {"setting": setting.name, "against": found.theirs.name, "cells": len(found.pairs)}
@@ -66,12 +65,9 @@ def _difference(results: Sequence[JobResult], setting: ArmSetting, arm: str) -> 
     for quality in qualities(results):
         line[quality.heading] = found.difference(value_of(quality))
     line["seconds"] = found.difference(lambda result: result.seconds)
-    for quality in qualities(results)[:1]:
+    for quality in qualities(results)[:1] if len(settings) > 1 else []:
         above = above_frontier(results, setting, arm, value_of(quality))
-        if len(settings_of(results, arm)) > 1:
-            line[f"{quality.heading} at equal count"] = Estimate.of(above) if above else None
-        spread = over_seeds(found.differences(value_of(quality)))
-        line[f"{quality.heading} over seeds"] = _rounded(spread, quality.digits)
+        line[f"{quality.heading} at equal count"] = Estimate.of(above) if above else None
     return line | {"unpaired": found.unpaired or None, "ended early": found.early or None}
 
 
@@ -91,27 +87,26 @@ def shown_comparison(lines: Sequence[Line], results: Sequence[JobResult]) -> lis
 
 def medians_table(results: Sequence[JobResult]) -> list[Line]:
     """Return medians over cells of every setting by objective and noise (paper table 1)."""
-    lines, axis, numbers = [], objective_axis(results), _compared(results)
+    axis, numbers = objective_axis(results), _compared(results)
+    gain = next((each for each in qualities(results) if arms_without_growth(results)), None)
+    lines = []
     for objective in sorted({result.cell[axis] for result in measured(results)}):
         of_objective = [result for result in results if result.cell[axis] == objective]
         for level in levels_of(of_objective):
             here = at_noise(of_objective, level)
             for setting in (each for arm in arms_of(here) for each in settings_of(here, arm)):
-                lines.append({"objective": objective, "noise": level, **_medians(here, setting, numbers)})
+                members = list(by_cell(here, setting).values())
+                line: Line = {"objective": objective, "noise": level, "setting": setting.name}
+                line["cells"] = len(members)
+                for each in numbers:
+                    line[each.heading] = _median(map(value_of(each), members), each.digits)
+                if gain is not None:
+                    gains = map(gain_over(here, value_of(gain)), members)
+                    line[f"{gain.label} over no growth"] = _median(gains, gain.digits)
+                line["seconds"] = _median((result.seconds for result in members), 1)
+                line["ended early"] = sum(result.ended_early for result in members) or None
+                lines.append(line)
     return _without_empty(lines)
-
-
-def _medians(results: Sequence[JobResult], setting: ArmSetting, numbers: Sequence[Number]) -> Line:
-    members = list(by_cell(results, setting).values())
-    line: Line = {"setting": setting.name, "cells": len(members)}
-    for each in numbers:
-        line[each.heading] = _median(map(value_of(each), members), each.digits)
-    for quality in qualities(results)[:1]:
-        if any(not result.grows for result in measured(results)):
-            gain = gain_over(results, value_of(quality))
-            line[f"{quality.label} over no growth"] = _median(map(gain, members), quality.digits)
-    line["seconds"] = _median((result.seconds for result in members), 1)
-    return line | {"ended early": sum(result.ended_early for result in members) or None}
 
 
 def jobs_table(results: Sequence[JobResult]) -> list[Line]:
@@ -131,34 +126,26 @@ def jobs_table(results: Sequence[JobResult]) -> list[Line]:
 
 
 def write_csv(path: Path, lines: Sequence[Line]) -> None:
-    """Write a table atomically, an estimate as three columns; an empty table writes no file."""
-    if not lines:
-        return
-    plain = [_columns(line) for line in lines]
-    columns = list(dict.fromkeys(key for line in plain for key in line))
+    """Write a table atomically, an estimate as three columns."""
+    plain = []
+    for line in lines:
+        plain.append({})
+        for key, value in line.items():
+            if isinstance(value, Estimate):
+                plain[-1] |= {key: value.median, f"{key}: low": value.low, f"{key}: high": value.high}
+            else:
+                plain[-1][key] = value
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns)
+        writer = csv.DictWriter(file, list(dict.fromkeys(key for line in plain for key in line)))
         writer.writeheader()
         writer.writerows(plain)
 
 
-def _columns(line: Line) -> Line:
-    found: Line = {}
-    for key, value in line.items():
-        if isinstance(value, Estimate):
-            found |= {key: value.median, f"{key}: low": value.low, f"{key}: high": value.high}
-        else:
-            found[key] = value
-    return found
-
-
 def _compared(results: Iterable[JobResult]) -> list[Number]:
     """Return the numbers of these results of which more or less is better, the count first."""
-    results = list(results)
-    known = {each.name: each for result in results for each in result.declared.values()}
-    named = {name for result in results for name in result.numbers}
-    found = [each for name, each in known.items() if each.is_more_better is not None and name in named]
-    return sorted(found, key=lambda each: each.name != COUNT.name)
+    found = {name: result.declared[name] for result in results for name in result.numbers}
+    compared = [each for each in found.values() if each.is_more_better is not None]
+    return sorted(compared, key=lambda each: each.name != COUNT.name)
 
 
 def _median(values: Iterable[float | None], digits: int) -> float | int | None:

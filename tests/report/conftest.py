@@ -25,7 +25,7 @@ STEPS = (40, 80, 120)
 # The chart that a densifier with a score declares. Its names are invented, because the reports know no score.
 SHAKE = Chart(
     title="Shaking of the Gaussians",
-    caption="How much each Gaussian shakes",
+    caption="How much each Gaussian shakes.",
     curves=(Curve(key="shake_median", label="median"),),
     score="shake",
     levels=(Level(label="tau_shake", value=0.1), Level(label="pure noise", value=0.229)),

@@ -4,12 +4,12 @@ import math
 
 import pytest
 
-from cadam3d.report.formatting import elapsed, number, plural, short, show, shown_bytes
+from cadam3d.report.formatting import elapsed, number, plural, short, show
 
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0, "0"), (1e-17, "0"), (12300, "12.3k"), (-50, "-50"), (2e6, "2M"), (1.2e-4, "1.2e-4"), (0.25, "0.25")],
+    [(0, "0"), (1e-17, "0"), (12300, "12.3k"), (-50, "-50"), (2e6, "2M"), (0.25, "0.25")],
 )
 def test_numbers_on_axes_are_short(value, text):
     assert short(value) == text
@@ -28,14 +28,10 @@ def test_any_value_has_a_text(value, text):
 
 @pytest.mark.parametrize(
     ("seconds", "text"),
-    [(1.54, "1.5 s"), (59.9, "59.9 s"), (75, "1 min 15 s"), (3599.6, "1 h 0 min"), (7260, "2 h 1 min")],
+    [(1.54, "1.5 s"), (59.9, "59.9 s"), (75, "0:01:15"), (7260, "2:01:00")],
 )
 def test_durations_have_suitable_units(seconds, text):
     assert elapsed(seconds) == text
-
-
-def test_bytes_have_suitable_units():
-    assert [shown_bytes(n) for n in (5, 2048, 3 << 20, 5 << 30)] == ["5 B", "2.0 KiB", "3.0 MiB", "5.0 GiB"]
 
 
 @pytest.mark.parametrize("value", [True, None, "3", math.inf, math.nan])

@@ -8,7 +8,7 @@ from splats import make_gaussians
 
 from cadam3d.io.ply import write_ply
 from cadam3d.io.run_folder import SNAPSHOTS, snapshot_name
-from cadam3d.report import growth, write_report
+from cadam3d.report import run_page, write_report
 
 
 def record(folder, *steps, size=100):
@@ -24,27 +24,27 @@ def asset(folder):
 
 def test_all_snapshots_are_shown_in_order_and_the_last_is_the_finished_object(tmp_path):
     record(tmp_path, 200, 0, 100)
-    found = growth.frames(tmp_path, 200)
-    assert [frame.step for frame in found] == [0, 100, 200]
-    assert base64.b64decode(found[1].data) == bytes([100]) * 100
+    found = run_page.frames(tmp_path, 200)
+    assert [step for step, _ in found] == [0, 100, 200]
+    assert base64.b64decode(found[1][1]) == bytes([100]) * 100
 
 
 def test_without_snapshots_the_asset_itself_is_shown(tmp_path):
     asset(tmp_path)
-    [frame] = growth.frames(tmp_path, 300)
-    assert frame.step == 300
-    assert base64.b64decode(frame.data).startswith(b"CADAM3DV")
+    [(step, data)] = run_page.frames(tmp_path, 300)
+    assert step == 300
+    assert base64.b64decode(data).startswith(b"CADAM3DV")
 
 
 def test_an_interrupted_run_ends_with_its_asset(tmp_path):
     record(tmp_path, 0, 50)
     asset(tmp_path)
-    assert [frame.step for frame in growth.frames(tmp_path, 70)] == [0, 50, 70]
+    assert [step for step, _ in run_page.frames(tmp_path, 70)] == [0, 50, 70]
 
 
 def test_snapshots_of_later_steps_are_left_out(tmp_path):
     record(tmp_path, 0, 50, 100)
-    assert [frame.step for frame in growth.frames(tmp_path, 50)] == [0, 50]
+    assert [step for step, _ in run_page.frames(tmp_path, 50)] == [0, 50]
 
 
 @pytest.mark.parametrize(
@@ -54,8 +54,8 @@ def test_snapshots_are_left_out_evenly_until_they_fit_and_the_last_one_stays(
     tmp_path, monkeypatch, room, steps
 ):
     record(tmp_path, 0, 1, 2, 3, 4)
-    monkeypatch.setattr(growth, "LARGEST", 100 * room)
-    assert [frame.step for frame in growth.frames(tmp_path, 4)] == steps
+    monkeypatch.setattr(run_page, "LARGEST", 100 * room)
+    assert [step for step, _ in run_page.frames(tmp_path, 4)] == steps
 
 
 def test_a_run_without_anything_to_show_has_a_page_without_a_program(tmp_path):

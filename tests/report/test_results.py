@@ -98,7 +98,7 @@ def test_a_job_without_a_psnr_has_that_of_its_evaluation(jobs):
 def test_thresholds_may_be_words(jobs):
     for views in ("sum_norm", "last"):
         jobs.add("baseline", f"densifier.views={views}", n=100, psnr=20.0)
-    assert [result.setting.short for result in read(jobs.folder)] == ["views sum_norm", "views last"]
+    assert [result.setting.values for result in read(jobs.folder)] == ["sum_norm", "last"]
 
 
 @pytest.mark.parametrize(

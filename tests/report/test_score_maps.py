@@ -44,7 +44,7 @@ def test_shares_of_a_map_add_to_one_at_every_step(bench_results):
 def test_declared_levels_are_drawn_with_their_values(jobs):
     jobs.files(jobs.add("cadam", n=500, psnr=20.0), 500)
     [axes] = draw(jobs.folder).axes
-    assert [text.get_text() for text in axes.texts] == ["tau_shake 0.1", "pure noise 0.229"]
+    assert [text.get_text() for text in axes.get_legend().texts] == ["tau_shake 0.1", "pure noise 0.229"]
     assert [line.get_ydata()[0] for line in axes.lines] == [0.1, 0.229]
 
 

@@ -26,7 +26,7 @@ def text_of(content: str) -> str:
 def test_a_whole_comparison_has_tables_figures_failures_and_command(whole, bench):
     text = text_of(whole)
     for expected in (
-        *("finished 144", "failed 1", "3 noise levels"),
+        *("finished 144", "failed 1"),
         *("Differences between arms", "PSNR (dB) at equal count", "Medians of every setting"),
         *("Quality against count", "Gaussians over time", "Selected Gaussians", "Arms side by side"),
         *("Shaking of the Gaussians", "How much each Gaussian shakes.", "tau_shake 0.1"),
@@ -150,7 +150,7 @@ def test_a_figure_that_does_not_exist_is_reported_and_the_others_are_drawn(jobs)
     jobs.figures = ["pie", "growth"]
     jobs.files(jobs.add("cadam", n=100, psnr=20.0), 100)
     text = text_of(report.write_sweep(jobs.folder).read_text(encoding="utf-8"))
-    assert "figures: no figure is called pie. The figures of this sweep are frontier," in text
+    assert "got pie" in text
     assert "Gaussians over time" in text
 
 
@@ -265,4 +265,4 @@ def test_numbers_of_a_column_have_the_same_decimals():
 
 def test_text_is_aligned_to_the_left_and_estimates_like_numbers():
     content = table([{"arm": "cadam", "fewer": "-94.2 [-95, -93]"}, {"arm": "none", "fewer": None}])
-    assert [column.is_text for column in content.columns] == [True, False]
+    assert content.is_text == [True, False]
