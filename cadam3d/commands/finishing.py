@@ -30,7 +30,7 @@ COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "ca
 
 @dataclass(frozen=True)
 class Results:
-    """What is made of the Gaussians after the last step: files and numbers."""
+    """The files and numbers that are made of the Gaussians after the last step."""
 
     exporters: Mapping[str, Exporter]
     metrics: Mapping[str, Metric]

@@ -6,7 +6,7 @@ from typing import Any
 
 @dataclass(frozen=True, kw_only=True)
 class Number:
-    """What a metric declares about a number that it measures.
+    """The declaration of a number that a metric measures.
 
     The declaration is kept beside the number in ``summary.json`` and ``eval.json``, so that tables, reports
     and ``select=`` need no list of metrics.

@@ -39,7 +39,7 @@ LONGEST_KEY = 200
 
 @dataclass(frozen=True)
 class Call:
-    """How a command was called, apart from the settings."""
+    """The way in which a command was called, apart from the settings."""
 
     words: Sequence[str]  # the overrides as they were typed
     hydra: DictConfig  # Hydra's own node

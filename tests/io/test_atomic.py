@@ -19,7 +19,7 @@ def test_the_temporary_file_keeps_folder_and_suffix(tmp_path):
         assert (temporary.parent, temporary.suffix) == (tmp_path, ".mp4")
 
 
-@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, UserError])
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
 def test_a_failing_block_leaves_the_old_file_and_no_other(tmp_path, error):
     (tmp_path / "a.txt").write_text("old")
 
