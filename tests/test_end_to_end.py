@@ -136,7 +136,7 @@ def test_a_run_is_refused_in_a_folder_that_holds_another_one(finished, type_in):
     latest = (finished / "outputs" / "latest").resolve()
     before = (latest / "asset.ply").read_bytes()
     _, err = type_in(finished, "train", *SMALL, f"hydra.run.dir={latest}", "seed=1", code=1)
-    assert "holds a run already" in err
+    assert "which a run would overwrite" in err
     _, err = type_in(finished, "train", f"resume={latest}", "seed=1", code=1)
     assert "seed: expected 0" in err
     assert (latest / "asset.ply").read_bytes() == before

@@ -20,7 +20,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.records import MEASUREMENTS, NUMBERS, Score, psnr_of, read_summary, scores_in, with_earlier
-from cadam3d.io.run_folder import ASSET, CONFIG, EVALUATION, shown, suggestion, typed_path
+from cadam3d.io.run_folder import CONFIG, EVALUATION, LATEST, shown, typed_path
 from cadam3d.metric.base import Measurand
 from cadam3d.prior.base import DiffusionPrior
 from cadam3d.prior.truth import PriorTruth, TruthSource
@@ -35,8 +35,7 @@ SHORT = 7  # characters of a commit, as git abbreviates it
 def run(cfg: DictConfig, call: Call) -> None:
     """Measure ``run=`` and write its ``eval.json``; for a sweep, measure every job and write its report."""
     if cfg.run is None:
-        line = suggestion("cadam3d eval", "run", CONFIG, ASSET)
-        raise UserError(f"run: expected a finished run or a sweep, got nothing. Try: {line}")
+        raise UserError(f"run: expected a finished run or a sweep, got nothing. Try: run={LATEST}")
     folder = typed_path(str(cfg.run))
     if folder.is_dir():
         require_contained(folder, None if cfg.trust else trusting(call))

@@ -23,12 +23,11 @@ from cadam3d.io.records import read_summary
 from cadam3d.io.run_folder import (
     ASSET,
     CONFIG,
+    LATEST,
     expanded,
     has_file,
-    resume_word,
     setting_word,
     shown,
-    suggestion,
     typed_path,
 )
 from cadam3d.rasterizer.base import Rasterizer, render_fn
@@ -60,7 +59,7 @@ def require_one(cfg: DictConfig) -> None:
     The value of ``ply=`` must not be the folder of a run, and that of ``ply_up=`` must be an axis or null.
     """
     if (cfg.run is None) == (cfg.ply is None):
-        got, line = ("neither", suggestion("", "run", ASSET)) if cfg.run is None else ("both", "ply=null")
+        got, line = ("neither", f"run={LATEST}") if cfg.run is None else ("both", "ply=null")
         raise UserError(f"run, ply: expected one of them, got {got}. Try: {line}")
     if cfg.ply is not None and has_file(expanded(str(cfg.ply)), CONFIG):
         line = f"ply=null {setting_word('run', cfg.ply)}"
@@ -73,7 +72,7 @@ def find_asset(folder: Path) -> Path:
     """Return the path of the asset of the run in ``folder``. Raises ``UserError`` if it has none yet."""
     ply = folder / ASSET
     if not has_file(ply):
-        line = f"cadam3d train {resume_word(shown(folder))}"
+        line = f"cadam3d train {setting_word('resume', shown(folder))}"
         # A run that has finished without the file was asked for other formats, or for none.
         if read_summary(folder).get("outcome") == Outcome.FINISHED:
             line += " 'exporter=[ply]'"
@@ -92,7 +91,7 @@ def find_run(text: str) -> Path:
     folder = typed_path(text)
     if has_file(folder, CONFIG):
         return folder
-    example = suggestion("", "run", CONFIG)
+    example = f"run={LATEST}"
     if not os.path.lexists(folder):
         reason = "no such folder"
     elif has_file(folder):

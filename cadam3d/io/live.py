@@ -18,7 +18,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import TEMPORARY
 from cadam3d.io.jsonl import is_number, is_whole, parse_json, to_json
 from cadam3d.io.lock import process_name
-from cadam3d.io.reading import read_bytes
+from cadam3d.io.reading import read_bytes, regular_descriptor
 from cadam3d.io.run_folder import (
     LIVE,
     LIVE_PAUSE,
@@ -96,15 +96,11 @@ def is_asked(run: Path, request: str) -> bool:
 
 
 def take_request(run: Path, request: str) -> bool:
-    """Return whether the file of a request existed, and remove it."""
-    if not is_asked(run, request):
-        return False
-    try:
-        (run / REQUESTS[request]).unlink()
-    # A request that cannot be removed would be carried out again and again.
-    except OSError:
-        return False
-    return True
+    """Return whether the file of a request existed, and remove it.
+
+    A request that cannot be removed does not count, because it would be carried out again and again.
+    """
+    return is_asked(run, request) and withdraw(run, request)
 
 
 @dataclass
@@ -181,15 +177,12 @@ def read_state(run: Path) -> dict[str, Any] | None:
 
 def _touch(path: Path) -> bool:
     """Create a file if it is missing, and set its time to now, without following a link."""
-    flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
-        descriptor = os.open(path, flags, 0o666)
+        descriptor = regular_descriptor(path, os.O_WRONLY | os.O_CREAT, follows_links=False)
         try:
-            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                return False
             os.utime(descriptor if os.utime in os.supports_fd else path)
         finally:
             os.close(descriptor)
-    except OSError:
+    except (OSError, UserError):
         return False
     return True

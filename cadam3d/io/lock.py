@@ -5,11 +5,9 @@ itself locks nothing, so one that a killed process has left behind has no effect
 process that inherits the open file holds the lock too. Windows does not pass locks on to children.
 """
 
-import json
 import os
 import shlex
 import socket
-import stat
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from cadam3d.core.errors import UserError
+from cadam3d.io.reading import regular_descriptor
 
 try:
     import fcntl
@@ -29,8 +28,7 @@ except ImportError:  # Windows
 INHERITED = "CADAM3D_LOCK"
 # On Windows, other processes cannot read a locked byte, so the byte that is locked is far behind the text.
 LOCKED_BYTE = 1 << 30
-# Bytes of a lock file that are read, and characters of each part that are shown.
-LONGEST_NOTE, LONGEST_SHOWN = 1 << 16, 160
+LONGEST_NOTE = 300  # bytes of a lock file that are read
 LOOKING_SECONDS = 0.02  # for which :func:`is_held` may hold a lock
 
 
@@ -143,7 +141,7 @@ def process_name() -> str:
 def holder_name(path: Path) -> str | None:
     """Return the :func:`process_name` in the note of the lock file ``path``; None without a note."""
     note = _read_note(path)
-    return None if note is None else f"{note[0]} on {note[1]}"
+    return None if note is None else note.partition(" since ")[0]
 
 
 @contextmanager
@@ -178,37 +176,25 @@ def taking_turns(folder: Path, on_wait: Callable[[], None]) -> Iterator[None]:
 
 def describe_holder(path: Path) -> str:
     """Describe the process that holds the lock file ``path``, as far as its note can be read."""
-    parts = _read_note(path)
-    if parts is None:
-        return "another process"
-    # The file may come from elsewhere, and a terminal would obey control characters.
-    pid, host, since, command = (
-        "".join(letter if letter.isprintable() else "?" for letter in part[:LONGEST_SHOWN]) for part in parts
-    )
-    return f"process {pid} on {host} since {since} ({command})"
+    note = _read_note(path)
+    return "another process" if note is None else f"process {note}"
 
 
-def _read_note(path: Path) -> list[str] | None:
-    """Return process id, host, time and command line of a note; None if there is none that can be read."""
+def _read_note(path: Path) -> str | None:
+    """Return the note in a lock file, in one line; None if there is none that can be read."""
     try:
         with _open(path, os.O_RDONLY) as file:
-            note = json.loads(file.read(LONGEST_NOTE))
-        return [str(note[key]) for key in ("pid", "host", "since", "command")]
-    except (OSError, UserError, ValueError, TypeError, KeyError, RecursionError):
+            note = file.read(LONGEST_NOTE).decode(errors="replace").strip()
+    except (OSError, UserError):
         return None
+    # The file may come from elsewhere, and a terminal would obey control characters.
+    return "".join(letter if letter.isprintable() else "?" for letter in note) or None
 
 
-def _open(path: Path, mode: int = os.O_RDWR | os.O_CREAT) -> IO[bytes]:
+def _open(path: Path, flags: int = os.O_RDWR | os.O_CREAT) -> IO[bytes]:
     """Open a lock file without changing its content, without following a link, and without waiting."""
-    for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY", "O_CLOEXEC"):
-        mode |= getattr(os, name, 0)
-    if path.is_symlink():
-        raise UserError(f"{path}: expected a lock file, got a link. Try: rm {shlex.quote(str(path))}")
-    descriptor = os.open(path, mode, 0o666)
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise UserError(f"{path}: expected a lock file, got something else. Try: rm {shlex.quote(str(path))}")
-    return os.fdopen(descriptor, "rb" if mode & os.O_RDWR == 0 else "r+b", buffering=0)
+    descriptor = regular_descriptor(path, flags, follows_links=False)
+    return os.fdopen(descriptor, "r+b" if flags & os.O_RDWR else "rb", buffering=0)
 
 
 def _inherited(path: Path) -> IO[bytes] | None:
@@ -237,14 +223,10 @@ def _is_open_at(file: IO[bytes], path: Path) -> bool:
 
 def _write_note(file: IO[bytes]) -> None:
     """Write into a lock file which process holds it."""
-    note = {
-        "pid": os.getpid(),
-        "host": socket.gethostname(),
-        "since": time.strftime("%Y-%m-%d %H:%M:%S"),
-        "command": shlex.join(["cadam3d", *sys.argv[1:]])[:LONGEST_SHOWN],
-    }
+    since = time.strftime("%Y-%m-%d %H:%M:%S")
+    note = f"{process_name()} since {since} ({shlex.join(['cadam3d', *sys.argv[1:]])})"
     # The lock works without the note, for example on a full disk.
     with suppress(OSError):
         file.truncate(0)
         file.seek(0)
-        file.write(json.dumps(note).encode() + b"\n")
+        file.write(note.encode(errors="replace"))

@@ -8,19 +8,16 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.lock import locked
 from cadam3d.io.run_folder import (
     LOCK,
-    OVERRIDES,
     RUN_FOLDER,
+    another_folder,
     claim,
-    copying,
     nearest_existing,
+    not_writable,
     numbered,
     occupant,
     remove_empty,
     require_writable,
-    resume_word,
-    setting_word,
     shown,
-    spare,
 )
 
 
@@ -34,21 +31,22 @@ def occupied(wanted: Path, *, is_chosen: bool, resume: Path | None) -> Iterator[
     would overwrite something in it, or if it cannot be written.
     """
     existing = nearest_existing(wanted if is_chosen else wanted.parent)
-    folder = wanted if resume is not None else claim(wanted, RUN_FOLDER, is_chosen=is_chosen)
+    folder = claim(wanted, RUN_FOLDER, is_chosen=is_chosen) if resume is None else wanted
+    key = RUN_FOLDER if resume is None else "resume"
     has_lock_file = (folder / LOCK).exists()
     with ExitStack() as stack:
         try:
-            if resume is not None:
-                require_writable(folder)
-            stack.enter_context(
-                locked(folder / LOCK, lambda holder: in_use(folder, holder, RUN_FOLDER, resume))
-            )
+            require_writable(folder)
+            stack.enter_context(locked(folder / LOCK, lambda holder: in_use(folder, holder, key)))
         except OSError as error:
-            raise _not_writable(folder, resume, error) from error
+            raise not_writable(key, folder, error) from error
         before = set(folder.iterdir())
         try:
-            if resume is None:
-                _refuse_occupied(folder)
+            if resume is None and (name := occupant(folder)) is not None:
+                raise UserError(
+                    f"{key}: {shown(folder)} holds {name}, which a run would overwrite. "
+                    f"Try: {another_folder(key, folder, shown(numbered(folder)))}"
+                )
             yield folder
         except BaseException as error:
             has_begun = set(folder.iterdir()) != before
@@ -56,49 +54,13 @@ def occupied(wanted: Path, *, is_chosen: bool, resume: Path | None) -> Iterator[
                 with suppress(OSError):
                     (folder / LOCK).unlink()
             remove_empty(folder, existing)
-            is_here = isinstance(error, OSError) and str(error.filename).startswith(str(folder))
-            if is_here and not has_begun:
-                raise _not_writable(folder, resume, error) from error
+            is_system = isinstance(error, OSError) and str(error.filename).startswith(str(folder))
+            if isinstance(error, OSError) and is_system and not has_begun:
+                raise not_writable(key, folder, error) from error
             raise
 
 
-def in_use(folder: Path, holder: str, key: str, resume: Path | None = None) -> UserError:
+def in_use(folder: Path, holder: str, key: str) -> UserError:
     """Return the error for a folder in which another process, described by ``holder``, writes."""
-    if resume is None:
-        return UserError(
-            f"{key}: {shown(folder)} is in use by {holder}. Try: {setting_word(key, shown(numbered(folder)))}"
-        )
-    return UserError(f"resume: {shown(folder)} is in use by {holder}. Try: {_resume_copy(folder, resume)}")
-
-
-def _refuse_occupied(folder: Path) -> None:
-    """Refuse a fresh run in a folder with a run, or with anything else that it would overwrite."""
-    name = occupant(folder)
-    if name is None:
-        return
-    if (folder / OVERRIDES).is_file():
-        raise UserError(
-            f"{RUN_FOLDER}: {shown(folder)} holds a run already ({name}). "
-            f"Try: cadam3d train {resume_word(shown(folder))}"
-        )
-    raise UserError(
-        f"{RUN_FOLDER}: {shown(folder)} holds {name}, which a run would overwrite. "
-        f"Try: {setting_word(RUN_FOLDER, shown(numbered(folder)))}"
-    )
-
-
-def _not_writable(folder: Path, resume: Path | None, error: OSError) -> UserError:
-    reason = error.strerror or str(error)
-    if resume is None:
-        line = setting_word(RUN_FOLDER, spare("cadam3d"))
-        return UserError(f"{RUN_FOLDER}: cannot write to {shown(folder)} ({reason}). Try: {line}")
-    return UserError(
-        f"resume: cannot write to {shown(folder)} ({reason}). Try: {_resume_copy(folder, resume)}"
-    )
-
-
-def _resume_copy(folder: Path, resume: Path) -> str:
-    """Return a line for the shell that continues a copy of the run in ``folder``."""
-    line, copy = copying(folder)
-    place = copy / resume.relative_to(folder) if resume.is_relative_to(folder) else copy
-    return f"{line} && cadam3d train {resume_word(place)}"
+    line = another_folder(key, folder, shown(numbered(folder)))
+    return UserError(f"{key}: {shown(folder)} is in use by {holder}. Try: {line}")

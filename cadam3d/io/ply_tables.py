@@ -153,7 +153,7 @@ def _read_rows(header: PlyHeader, file: BinaryIO, element: Element) -> np.ndarra
     # A property that appears twice is a ValueError too.
     try:
         record = np.dtype([(name, order + kind) for name, kind in element.properties if kind])
-        if len(record) < len(element.properties):
+        if len(record.names or ()) < len(element.properties):
             raise ValueError("expected numbers, got a list")
         if header.encoding == ASCII:
             rows = _text_rows(file, element.count, record)

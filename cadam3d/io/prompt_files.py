@@ -8,7 +8,7 @@ reported in one message that names the line or the entry.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from cadam3d.core.checks import fail, require, require_choice
 from cadam3d.io.jsonl import parse_json
@@ -18,7 +18,6 @@ from cadam3d.io.run_folder import expanded, has_file
 SETS = Path(__file__).with_name("prompt_sets")
 # The setting of a run for each key of an entry, besides the prompt.
 SETTINGS = {"negative_prompt": "negative_prompt", "initializer_prompt": "initializer.prompt"}
-ENTRY = ("prompt", *SETTINGS, "name", "category")
 JSON, YAML, PLAIN = (".json",), (".yaml", ".yml"), (".txt", ".text", "")
 LARGEST = 1 << 22  # bytes of a file
 MOST = 10_000  # prompts in a file
@@ -28,6 +27,7 @@ LONGEST = 10_000
 # Composite prompts of threestudio refer to its own library in this way, by some words of a prompt.
 REFERENCE = "lib:"
 EXAMPLE = "cadam3d sweep prompts=paper50"
+KEYS = ", ".join(("prompt", *SETTINGS, "name", "category"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +38,22 @@ class Prompt:
     settings: tuple[tuple[str, str], ...] = ()  # keys and values
     name: str = ""
     category: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Entry:
+    """The keys of an entry, which pydantic checks."""
+
+    __pydantic_config__: ClassVar = {
+        "extra": "forbid",
+        "str_strip_whitespace": True,
+        "str_max_length": LONGEST,
+    }
+    prompt: str
+    negative_prompt: str | None = None
+    initializer_prompt: str | None = None
+    name: str | None = None
+    category: str | None = None
 
 
 def set_names() -> list[str]:
@@ -99,40 +115,32 @@ def _entries(path: Path, place: str) -> Iterator[tuple[str, Any, str]]:
     for name, items in lists.items():
         expected = "a list of prompts, or names with lists of prompts"
         require(isinstance(items, list), place, expected=expected, got=items, example=EXAMPLE)
-        category = _text(place, name, "the name of a category") if len(lists) > 1 else ""
         for number, item in enumerate(items, start=1):
-            yield f"{place}, {f'{name!r}, ' if name else ''}entry {number}", item, category
+            where = f"{place}, {f'{name!r}, ' if name else ''}entry {number}"
+            yield where, item, name if len(lists) > 1 else ""
 
 
 def _prompt(place: str, entry: Any, category: str) -> Prompt:
     """Return the prompt of an entry: a text, or keys with a text for each."""
-    if not isinstance(entry, dict):
-        return Prompt(text=_text(place, entry, "a prompt"), category=category)
-    for key in entry:
-        require_choice(f"{place}: a key", key, ENTRY)
-    given = {key: value for key, value in entry.items() if value is not None}
-    texts = {key: _text(place, value, key) for key, value in given.items() if key not in SETTINGS}
-    require("prompt" in texts, place, expected="the key prompt", got=", ".join(entry), example=EXAMPLE)
-    settings = [
-        (setting, _text(place, given[key], key, may_be_empty=key == "negative_prompt"))
-        for key, setting in SETTINGS.items()
-        if key in given
-    ]
+    from pydantic import TypeAdapter  # takes a tenth of a second to load
+
+    keys = entry if isinstance(entry, dict) else {"prompt": entry}
+    try:
+        found = TypeAdapter(_Entry).validate_python({"category": category} | keys)
+        texts = [text for text in vars(found).values() if text is not None]
+        if not found.prompt or not all(map(_is_plain, texts)):
+            raise ValueError
+    except ValueError as error:
+        expected = f"a prompt as plain text of at most {LONGEST} characters, or texts for {KEYS}"
+        raise fail(place, expected=expected, got=str(entry)[:60], example=EXAMPLE) from error
+    settings = [(setting, getattr(found, key)) for key, setting in SETTINGS.items()]
     return Prompt(
-        text=texts["prompt"],
-        settings=tuple(settings),
-        name=texts.get("name", ""),
-        category=texts.get("category", category),
+        text=found.prompt,
+        settings=tuple((setting, text) for setting, text in settings if text is not None),
+        name=found.name or "",
+        category=found.category or "",
     )
 
 
-def _text(place: str, value: Any, what: str, *, may_be_empty: bool = False) -> str:
-    """Return a text without blanks around it. Raises ``UserError`` if it cannot be ``what``."""
-    text = value.strip() if isinstance(value, str) else ""
-    is_empty = isinstance(value, str) and not text
-    is_plain = is_readable(text) and len(text) <= LONGEST and text != "???" and not text.startswith(REFERENCE)
-    expected = f"{what} as plain text of at most {LONGEST} characters"
-    got = value[:60] if isinstance(value, str) else value
-    is_text = is_plain if text else is_empty and may_be_empty
-    require(is_text, place, expected=expected, got=got, example=EXAMPLE)
-    return text
+def _is_plain(text: str) -> bool:
+    return is_readable(text) and text != "???" and not text.startswith(REFERENCE)

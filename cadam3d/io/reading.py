@@ -58,20 +58,28 @@ def unusable(path: Path, problem: str) -> UserError:
     return UserError(f"{path}: {problem}. Try: another file")
 
 
-def open_regular(path: Path) -> BinaryIO:
-    """Open a file for reading bytes.
+def regular_descriptor(path: Path, flags: int, *, follows_links: bool = True) -> int:
+    """Open a file with ``flags`` of ``os.open``, without waiting, and return its descriptor.
 
     Raises ``UserError`` if ``path`` is not a regular file, and ``OSError`` if it cannot be opened (for a name
     with a null byte, ``ValueError``).
     """
-    # Without this flag, opening a named pipe waits for a writer.
-    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
-    mode = os.fstat(descriptor).st_mode
-    if not stat.S_ISREG(mode):
+    if not follows_links and path.is_symlink():
+        raise unusable(path, "expected a file, got a link")
+    # Without O_NONBLOCK, opening a named pipe waits for a writer.
+    for name in ("O_NONBLOCK", "O_BINARY", "O_CLOEXEC", *(() if follows_links else ("O_NOFOLLOW",))):
+        flags |= getattr(os, name, 0)
+    descriptor = os.open(path, flags, 0o666)
+    kind = stat.S_IFMT(os.fstat(descriptor).st_mode)
+    if kind != stat.S_IFREG:
         os.close(descriptor)
-        kind = KINDS.get(stat.S_IFMT(mode), "something else")
-        raise unusable(path, f"expected a file, got {kind}")
-    return os.fdopen(descriptor, "rb")
+        raise unusable(path, f"expected a file, got {KINDS.get(kind, 'something else')}")
+    return descriptor
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file for reading bytes. Raises the exceptions of :func:`regular_descriptor`."""
+    return os.fdopen(regular_descriptor(path, os.O_RDONLY), "rb")
 
 
 def open_contained(folder: Path, name: str) -> BinaryIO:

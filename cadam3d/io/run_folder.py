@@ -181,10 +181,20 @@ def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:
                 free = folder.with_name(f"{folder.name}-{number}")
         require_writable(free)
     except OSError as error:
-        raise UserError(
-            f"{key}: cannot write to {free} ({error.strerror or error}). Try: {key}={spare('cadam3d')}"
-        ) from error
+        raise not_writable(key, free, error) from error
     return free
+
+
+def not_writable(key: str, folder: Path, error: OSError) -> UserError:
+    """Return the error for a folder that the setting ``key`` names and that cannot be written."""
+    example = another_folder(key, folder, spare("cadam3d"))
+    return UserError(f"{key}: cannot write to {shown(folder)} ({error.strerror or error}). Try: {example}")
+
+
+def another_folder(key: str, folder: Path, free: Path) -> str:
+    """Return what to type to use the folder ``free``: the setting ``key``, or a copy of a run to resume."""
+    copy = f"cp -r {shlex.quote(str(shown(folder)))} {shlex.quote(str(free))}"
+    return copy if key == "resume" else setting_word(key, free)
 
 
 def require_writable(folder: Path) -> None:
@@ -223,25 +233,6 @@ def numbered(path: Path, *, first: int = 2, suffix: str = "") -> Path:
 def spare(name: str, *, suffix: str = "") -> Path:
     """Return a path in the folder for temporary files that does not exist yet, to suggest it to the user."""
     return numbered(Path(tempfile.gettempdir(), name), first=1, suffix=suffix)
-
-
-def copying(run: Path) -> tuple[str, Path]:
-    """Return a shell command that copies ``run`` to a place that can be written, and the path of the copy."""
-    copy = spare(run.name or "run")
-    source, target = shlex.quote(str(shown(run))), shlex.quote(str(copy))
-    return f"cp -rL {source} {target} && chmod -R u+w {target}", copy
-
-
-def suggestion(command: str, key: str, *needed: str) -> str:
-    """Return ``COMMAND KEY=outputs/latest`` if that has the files ``needed``, or how to train a run."""
-    if not all(has_file(Path(LATEST), name) for name in needed):
-        return 'cadam3d train prompt="a red torus"'
-    return f"{command} {key}={LATEST}".strip()
-
-
-def resume_word(place: str | Path) -> str:
-    """Return ``resume=PLACE`` as it is typed into a shell."""
-    return setting_word("resume", place)
 
 
 def setting_word(key: str, value: object) -> str:

@@ -33,8 +33,8 @@ from cadam3d.io.run_folder import (
     SAVED_PATTERN,
     SUMMARY,
     TURNTABLE,
-    resume_word,
     saved_name,
+    setting_word,
     shown,
 )
 from cadam3d.live.curves import Curves
@@ -147,7 +147,7 @@ class ShownRun(ShownFile):
         facts = {
             "kind": "run",
             "title": title[:LONGEST_TITLE] if isinstance(title, str) else self.place.name,
-            "resume": f"cadam3d train {resume_word(shown(self.place))}",
+            "resume": f"cadam3d train {setting_word('resume', shown(self.place))}",
             "picture": _name(self._version(LIVE_SNAPSHOT if self._shows_snapshot(now) else ASSET)),
             "charts": f"{self._curves.version} {_name(self._declared.version())}",
             "saved": self._saved(),

@@ -13,7 +13,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.run_folder import OVERRIDES, RUN_FOLDER, has_file, resume_word, suggestion, typed_path
+from cadam3d.io.run_folder import LATEST, OVERRIDES, RUN_FOLDER, has_file, setting_word, typed_path
 from cadam3d.settings.compose import TEXT_KEYS, quote
 from cadam3d.settings.options import config_dir
 from cadam3d.settings.trust import is_trusted, judge_overrides, read_overrides, require_contained
@@ -166,18 +166,18 @@ def resumed(
     if "resume" not in given or (text := text_of(given["resume"])) in ("null", ""):
         return list(overrides)
     if is_sweep:
-        raise UserError(f"resume: continues one run, not a sweep. Try: cadam3d train {resume_word(text)}")
+        raise UserError(f"resume: continues one run, not a sweep. Try: {setting_word('resume', text)}")
     path = typed_path(text)
     holders = [place for place in (path, *path.parents) if has_file(place, OVERRIDES)]
     folder = holders[0] if holders and os.path.lexists(path) else None
     if folder is None or (path.is_dir() and path != folder):
         raise UserError(
             f"resume: expected the folder of a run (it contains {OVERRIDES}), got {text!r}. "
-            f"Try: {suggestion('cadam3d train', 'resume', OVERRIDES)}"
+            f"Try: resume={LATEST}"
         )
     if RUN_FOLDER in given and typed_path(text_of(given[RUN_FOLDER])) != folder:
         raise UserError(
-            f"{RUN_FOLDER}: a resumed run stays in its folder. Try: cadam3d train {resume_word(text)}"
+            f"{RUN_FOLDER}: a resumed run stays in its folder. Try: {setting_word('resume', text)}"
         )
     is_judged = not is_trusted(overrides)
     require_contained(folder, retry if is_judged else None)

@@ -33,11 +33,11 @@ from cadam3d.io.run_folder import (
     claim,
     has_file,
     holds_run,
+    not_writable,
     numbered,
     occupant_of_sweep,
     setting_word,
     shown,
-    spare,
 )
 from cadam3d.settings.compose import flatten, quote
 from cadam3d.settings.hydra import run_hydra
@@ -250,8 +250,7 @@ def _locked(folder: Path, key: str) -> Iterator[None]:
         try:
             stack.enter_context(locked(folder / LOCK, lambda holder: in_use(folder, holder, key)))
         except OSError as error:
-            reason, example = error.strerror or error, setting_word(key, spare("cadam3d"))
-            raise UserError(f"{key}: cannot write to {shown(folder)} ({reason}). Try: {example}") from error
+            raise not_writable(key, folder, error) from error
         yield
 
 

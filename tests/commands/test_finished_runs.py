@@ -52,7 +52,7 @@ def run_folder(tmp_path, gaussians) -> Path:
 @pytest.mark.parametrize(
     ("words", "got", "hint"),
     [
-        ((), "neither", 'cadam3d train prompt="a red torus"'),
+        ((), "neither", "run=outputs/latest"),
         (("run=a", "ply=b"), "both", "ply=null"),
     ],
 )
