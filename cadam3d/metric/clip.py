@@ -1,9 +1,10 @@
 """Clip: pictures and texts in the shared space of a CLIP model (Radford et al. 2021)."""
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache
 from typing import Any
 
 import torch
@@ -11,11 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from cadam3d.metric.scoring import ModelMetric, Scorer, cut_off
-from cadam3d.metric.transformer import TransformerFolder, TransformerSource
+from cadam3d.metric.scoring import ModelMetric, Scorer, too_long
+from cadam3d.metric.transformer import TransformerFolder, TransformerSource, kept
 
-# The number of models in memory. With them, several metrics and all jobs of a sweep load each model once.
-KEPT = 2
 # The settings of an image processor that change the pixels.
 PREPROCESSING = ("size", "resample", "crop_size", "do_center_crop", "image_mean", "image_std")
 
@@ -37,7 +36,7 @@ class Clip:
         return normalize(_vectors(self.model.get_image_features(pixel_values=pixel_values)), dim=-1)
 
     def texts(self, texts: Sequence[str]) -> Float[Tensor, "t d"]:
-        """Return a unit vector for each text. Long texts are cut off (see :meth:`lost_tokens`)."""
+        """Return a unit vector for each text. Long texts are cut off (see :meth:`complaints`)."""
         tokens = self.tokenizer(
             list(texts), padding=True, truncation=True, max_length=self.longest, return_tensors="pt"
         ).to(self._device)
@@ -46,17 +45,9 @@ class Clip:
         )
         return normalize(_vectors(features), dim=-1)
 
-    def lost_tokens(self, text: str) -> int:
-        """Return how many tokens of a text the model cannot read."""
-        return max(0, len(self._all_tokens(text)) - self.longest)
-
-    def tokens(self, text: str) -> list[int]:
-        """Return the tokens of a text that the model reads; those of a long text lack the mark of its end."""
-        return self._all_tokens(text)[: self.longest - 1]
-
-    def complaint(self, text: str) -> str | None:
-        """Return a warning about a text that is too long for the model; None if it reads all of it."""
-        return cut_off(self.lost_tokens(text), self.longest)
+    def complaints(self, text: str) -> tuple[str, ...]:
+        """Return a warning about a text that is too long for the model; none if it reads all of it."""
+        return too_long(len(self.tokenizer(text, verbose=False)["input_ids"]), self.longest)
 
     def scorer(self, factor: float = 1.0) -> Scorer:
         """Return what gives each picture ``factor`` times its cosine with the text."""
@@ -64,11 +55,8 @@ class Clip:
         return Scorer(
             score=lambda images, text: factor * self.pictures(images) @ direction(text),
             facts=self.facts,
-            complaint=self.complaint,
+            complaints=self.complaints,
         )
-
-    def _all_tokens(self, text: str) -> list[int]:
-        return self.tokenizer(text, verbose=False)["input_ids"]
 
     @property
     def longest(self) -> int:
@@ -97,10 +85,9 @@ class ClipMetric(ModelMetric):
 def load_clip(source: TransformerSource, device: torch.device) -> Clip:
     """Return the CLIP model of ``source``, on ``device``. Raises ``UserError`` if it is not available."""
     found = source.find()
-    return _loaded(found, found.facts()["weights_sha256"], device)
+    return kept(_loaded, found, found.facts()["weights_sha256"], device)
 
 
-@lru_cache(maxsize=KEPT)
 def _loaded(found: TransformerFolder, _sha256: str, device: torch.device) -> Clip:
     import transformers
 
@@ -117,10 +104,10 @@ def assembled(found: TransformerFolder, model: Any, facts: dict[str, Any], devic
 def _settings(model: Any, preprocess: Any) -> dict[str, Any]:
     """Return what is not in the weights and changes a score, for its record: pictures and activations."""
     known = preprocess.to_dict()
-    steps = {name: known.get(name) for name in PREPROCESSING}
+    # With lists instead of tuples, as the record has them in a file.
+    steps = json.loads(json.dumps({name: known.get(name) for name in PREPROCESSING}))
     activations = {model.config.text_config.hidden_act, model.config.vision_config.hidden_act}
-    plain = {name: list(value) if isinstance(value, tuple) else value for name, value in steps.items()}
-    return {"preprocessing": plain, "activation": " and ".join(sorted(activations))}
+    return {"preprocessing": steps, "activation": " and ".join(sorted(activations))}
 
 
 def check_clip(found: TransformerFolder) -> tuple[Any, Any]:
@@ -130,7 +117,7 @@ def check_clip(found: TransformerFolder) -> tuple[Any, Any]:
     """
     import transformers
 
-    if found.config().get("model_type") != "clip":
+    if found.entries().get("model_type") != "clip":
         raise found.damaged("it is not a CLIP model (model_type: clip) of transformers")
     tokenizer = found.read(transformers.CLIPTokenizer)
     # If the files of a tokenizer are missing, transformers silently makes one that knows no word.

@@ -16,7 +16,6 @@ from cadam3d.metric.clip import ClipMetric, load_clip
 from cadam3d.metric.scoring import LEVEL, Scorer, interval_record
 
 KEY = "metric.clip_r_precision.prompts"
-EXAMPLE = f"{KEY}=paper50"
 BATCH = 64  # texts that are read at once
 
 
@@ -53,20 +52,14 @@ class ClipRPrecision(ClipMetric):
         known = torch.cat([clip.texts(texts[at : at + BATCH]) for at in range(0, len(texts), BATCH)])
         own = cache(lambda text: clip.texts([text])[0])
 
-        @cache
-        def has_double(text: str) -> bool:
-            """Return whether the model reads another prompt as this one, because it cuts off both."""
-            return any(other != text and clip.tokens(other) == clip.tokens(text) for other in texts)
-
         def score(images: Tensor, text: str) -> Tensor:
-            if has_double(text):
-                return torch.zeros(len(images))
             pictures = clip.pictures(images)
             others = known[[other != text for other in texts]]
             return (pictures @ own(text) > (pictures @ others.T).amax(dim=1)).double()
 
-        facts = {"candidates": len(candidates), "candidates_sha256": _hash(candidates)}
-        return Scorer(score=score, facts=clip.facts | facts, complaint=clip.complaint)
+        digest = hashlib.sha256("\n".join(candidates).encode()).hexdigest()
+        facts = {"candidates": len(candidates), "candidates_sha256": digest}
+        return Scorer(score=score, facts=clip.facts | facts, complaints=clip.complaints)
 
     def interval(self, values: Float[Tensor, "v"]) -> dict[str, Any] | None:
         """Return the 95 % interval of the share over viewpoints, by Wilson's formula for a proportion."""
@@ -82,9 +75,5 @@ def read_candidates(source: str) -> list[str]:
     Raises ``UserError`` for other files, and for fewer than two prompts.
     """
     candidates = [prompt.text for prompt in read_prompts(source, KEY)]
-    require(len(candidates) > 1, KEY, expected="at least two prompts", got=source, example=EXAMPLE)
+    require(len(candidates) > 1, KEY, expected="at least two prompts", got=source)
     return candidates
-
-
-def _hash(texts: list[str]) -> str:
-    return hashlib.sha256("\n".join(texts).encode()).hexdigest()

@@ -1,24 +1,23 @@
 """Hps: Human Preference Score v2, how much people would like a picture for its prompt."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 
-from cadam3d.core.checks import require, require_choice
+from cadam3d.core.checks import fail, require_choice
 from cadam3d.core.errors import UserError
+from cadam3d.core.memory import is_out_of_memory
 from cadam3d.core.number import Number
-from cadam3d.io.pretrained import fetch_file, read_tensors, short
-from cadam3d.metric.clip import Clip, ClipMetric, assembled, check_clip, load_clip
+from cadam3d.io.pretrained import read_tensors, short
+from cadam3d.metric.clip import Clip, ClipMetric, assembled, check_clip
 from cadam3d.metric.open_clip import clip_model
 from cadam3d.metric.scoring import Scorer
-from cadam3d.metric.transformer import TransformerFolder, TransformerSource, sha256_of
+from cadam3d.metric.transformer import TransformerFolder, TransformerSource, downloaded, kept, model_facts
 
 # The file of each version in the repository of the authors, xswu/HPSv2.
 FILES = {"v2.0": "HPS_v2_compressed.pt", "v2.1": "HPS_v2.1_compressed.pt"}
-SUFFIXES = (".pt", ".pth", ".bin", ".safetensors")
 # The files of a CLIP model except its weights, all of which are small.
 SMALL = ("*.json", "*.txt")
 
@@ -43,75 +42,44 @@ class Hps(ClipMetric):
 
     def __post_init__(self) -> None:
         require_choice(f"{self.node}.version", self.version, tuple(FILES))
-        require(
-            isinstance(self.base, str) and self.base.strip() != "",
-            f"{self.node}.base",
-            expected="a folder or an id on the hub",
-            got=self.base,
-            example=f"{self.node}.base=laion/CLIP-ViT-H-14-laion2B-s32B-b79K",
-        )
 
     def prepare(self) -> None:
         """Find the files of the model, after a download if necessary, and check that they are complete."""
-        if self._is_folder():
-            super().prepare()
-        else:
-            check_clip(self._base())
-            # The file is mapped, so this reads little of it.
-            read_tensors(f"{self.node}.model", self._file(self.source())[0])
+        check_clip(self._base())
+        # The file is mapped, so this reads little of it.
+        read_tensors(f"{self.node}.model", self._file()[0])
 
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture a score in [-1, 1]."""
-        clip = load_clip(self.source(), device) if self._is_folder() else self._from_file(device)
-        return clip.scorer()
-
-    def _is_folder(self) -> bool:
-        return Path(self.source().model).expanduser().is_dir()
+        file, name, revision = self._file()
+        facts = model_facts(name, revision, [file])
+        return kept(_loaded, file, self._base(), tuple(facts.items()), device).scorer()
 
     def _base(self) -> TransformerFolder:
-        return TransformerSource(self.node, self.base, None, "base", SMALL).find()
+        return TransformerSource(f"{self.node}.base", self.base, needed=SMALL).find()
 
-    def _from_file(self, device: torch.device) -> Clip:
-        source, base = self.source(), self._base()
-        file, revision = self._file(source)
-        model = source.model if revision is None else f"{source.model}/{file.name}"
-        facts = {"model": model, "revision": revision, "weights_sha256": sha256_of([file])}
-        return _loaded(file, base, tuple(facts.items()), device)
-
-    def _file(self, source: TransformerSource) -> tuple[Path, str | None]:
-        """Return the file with the weights, and its commit if it is from the hub."""
+    def _file(self) -> tuple[Path, str, str | None]:
+        """Return the file with the weights, its name in records, and its commit if it is from the hub."""
+        source, name = self.source(), FILES[self.version]
         file = Path(source.model).expanduser()
         if file.is_file():
-            return file, None
-        name = FILES[self.version]
-        if file.suffix in SUFFIXES or source.model.count("/") != 1:
-            raise UserError(
-                f"{source.name}: expected a file such as {name}, a folder with a CLIP model of transformers "
-                f"or null, got {source.model!r}: nothing there. Try: {source.name}=null"
-            )
-        found, reason, _ = fetch_file(source.model, name, source.revision, True)
-        if found is None:
-            raise UserError(
-                f"{source.name}: no model is available. {source.model}: {reason}. Try, with a network "
-                f"connection: hf download {source.model} {name} --local-dir models. Then: "
-                f"{source.name}=models/{name}"
-            )
-        # In the cache of the hub, the name of the folder of a file is its commit.
-        return found, found.parent.name
+            return file, source.model, None
+        if source.model.count("/") != 1:
+            raise fail(source.key, expected=f"a file such as {name}, or OWNER/NAME", got=source.model)
+        folder = downloaded(source.key, source.model, source.revision, (name,))
+        return folder / name, f"{source.model}/{name}", folder.name
 
 
-@lru_cache(maxsize=1)
 def _loaded(
-    file: Path, base: TransformerFolder, facts: tuple[tuple[str, Any], ...], device: torch.device
+    file: Path, base: TransformerFolder, facts: tuple[tuple[str, str | None], ...], device: torch.device
 ) -> Clip:
     """Return the model in a file. ``facts`` has the hash of the file, so a changed file is read again."""
     try:
-        model = clip_model(read_tensors(f"{Hps.node}.model", file), base.config())
+        model = clip_model(read_tensors(f"{Hps.node}.model", file), base.entries())
     except (ValueError, RuntimeError, TypeError, KeyError) as error:
-        if isinstance(error, torch.OutOfMemoryError):
+        if is_out_of_memory(error):
             raise
         raise UserError(
-            f"{Hps.node}.model: {file} does not fit {Hps.node}.base={base.source.model} ({short(error)}). "
-            f"Try: {Hps.node}.model=null"
+            f"{Hps.node}.model: {file} does not fit {Hps.node}.base={base.source.model} ({short(error)})"
         ) from error
     return assembled(base, model, dict(facts), device)

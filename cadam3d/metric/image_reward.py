@@ -2,9 +2,8 @@
 
 from contextlib import redirect_stdout
 from dataclasses import dataclass
-from functools import lru_cache
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from io import StringIO
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,13 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
+from cadam3d.core.memory import is_out_of_memory
 from cadam3d.core.number import Number
 from cadam3d.io.image import to_uint8
 from cadam3d.io.pretrained import short
-from cadam3d.metric.scoring import ScoreMetric, Scorer, cut_off
-from cadam3d.metric.transformer import sha256_of
+from cadam3d.metric.scoring import ScoreMetric, Scorer, too_long
+from cadam3d.metric.transformer import kept, model_facts
 
 MODULE, PACKAGE = "ImageReward", "image-reward"
 NAME = "ImageReward-v1.0"
@@ -52,86 +51,58 @@ class ImageReward(ScoreMetric):
 
     model: str | None  # a folder with WEIGHTS and SETTINGS; None = the cache of the package
 
-    def __post_init__(self) -> None:
-        require(
-            self.model is None or (isinstance(self.model, str) and self.model.strip() != ""),
-            f"{self.node}.model",
-            expected="a folder or null",
-            got=self.model,
-            example=f"{self.node}.model=null",
-        )
-
     def prepare(self) -> None:
         """Import the package, and find the files of the model, after a download if that is necessary."""
-        package = _package(self.node)
-        if NAME in self._named():
-            self._load(package, torch.device("cpu"))
+        _package()
+        if not (self._folder() / WEIGHTS).is_file():
+            self.scorer(torch.device("cpu"))
 
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture a reward."""
-        model, sha256 = self._load(_package(self.node), device)
-        facts = {"model": NAME, "revision": None, "weights_sha256": sha256, "package": _version()}
-        return Scorer(
-            score=lambda images, text: _rewards(model, images, text),
-            facts=facts,
-            complaint=lambda text: _complaint(model, text),
-        )
-
-    def _load(self, package: Any, device: torch.device) -> tuple[Any, str]:
-        """Return the model and the hash of its weights."""
+        package, folder = _package(), self._folder()
         try:
-            model = _loaded(package, *self._named(), device)
-            return model, sha256_of([self._folder() / WEIGHTS])
+            model = kept(_loaded, package, self._name(), folder, device)
+            facts = model_facts(NAME, None, [folder / WEIGHTS])
         # The package, and the libraries below it, raise almost anything.
         except Exception as error:
-            if isinstance(error, torch.OutOfMemoryError):
+            if is_out_of_memory(error):
                 raise
-            raise self._missing(short(error)) from error
+            raise UserError(
+                f"{self.node}.model: no model is available ({short(error)}). Try, with a network connection: "
+                f"{DOWNLOAD}. Then: {self.node}.model={FOLDER}"
+            ) from error
+        installed = next((each.version for each in distributions(name=PACKAGE)), None)
+        return Scorer(
+            score=lambda images, text: _rewards(model, images, text),
+            facts={**facts, "package": installed},
+            complaints=lambda text: too_long(len(model.blip.tokenizer(text)["input_ids"]), LONGEST),
+        )
 
-    def _named(self) -> tuple[str, str | None, str | None]:
-        """Return what the package calls name, download_root and med_config; with NAME, it downloads."""
-        folder = self._folder()
-        files = (folder / WEIGHTS, folder / SETTINGS)
-        if lacking := [file for file in files if not file.is_file()]:
-            if self.model is not None:
-                raise self._missing(f"{lacking[0]} is missing")
-            return NAME, str(folder), None
-        return str(files[0]), None, str(files[1])
+    def _name(self) -> str:
+        """Return what the package reads: the file of the weights, or NAME, which it downloads."""
+        weights = self._folder() / WEIGHTS
+        return str(weights) if self.model is not None or weights.is_file() else NAME
 
     def _folder(self) -> Path:
         return (CACHE if self.model is None else Path(self.model)).expanduser()
 
-    def _missing(self, reason: str) -> UserError:
-        return UserError(
-            f"{self.node}.model: no model is available ({reason}). Try, with a network connection: "
-            f"{DOWNLOAD}. Then: {self.node}.model={FOLDER}"
-        )
 
-
-def _package(key: str) -> Any:
+def _package() -> Any:
     """Return the package. Raises ``UserError`` if it, or something that it needs, cannot be imported."""
     try:
         return import_module(MODULE)
     # A package with old requirements fails in many ways beside new libraries.
     except Exception as error:
         raise UserError(
-            f"{key}: the package {PACKAGE} cannot be imported ({short(error)}). "
+            f"{ImageReward.node}: the package {PACKAGE} cannot be imported ({short(error)}). "
             f"Try, in a new environment: {INSTALL}"
         ) from error
 
 
-@lru_cache(maxsize=1)  # it has gigabytes, and all jobs of a sweep need it
-def _loaded(package: Any, name: str, root: str | None, settings: str | None, device: torch.device) -> Any:
+def _loaded(package: Any, name: str, folder: Path, device: torch.device) -> Any:
+    settings = None if name == NAME else str(folder / SETTINGS)
     with redirect_stdout(StringIO()):  # the package prints where it loads from
-        return package.load(name, device=device, download_root=root, med_config=settings)
-
-
-def _version() -> str | None:
-    """Return the version of the package for the record of a number; None if it was not installed by pip."""
-    try:
-        return version(PACKAGE)
-    except PackageNotFoundError:
-        return None
+        return package.load(name, device=device, download_root=str(folder), med_config=settings)
 
 
 def _rewards(model: Any, images: Float[Tensor, "v h w 3"], text: str) -> Float[Tensor, "v"]:
@@ -140,8 +111,3 @@ def _rewards(model: Any, images: Float[Tensor, "v h w 3"], text: str) -> Float[T
     with torch.no_grad():
         rewards = [model.score(text, Image.fromarray(picture)) for picture in to_uint8(images)]
     return torch.tensor(rewards, dtype=torch.float64)
-
-
-def _complaint(model: Any, text: str) -> str | None:
-    """Return a warning about a text that is too long for the package; None if it reads all of it."""
-    return cut_off(len(model.blip.tokenizer(text)["input_ids"]) - LONGEST, LONGEST)

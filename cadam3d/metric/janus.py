@@ -13,7 +13,7 @@ and the asset has as many fronts as there are separate maxima of "front" over th
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import Any, ClassVar
 
@@ -95,7 +95,7 @@ class Janus(ClipMetric):
         return Scorer(
             score=lambda images, text: clip.logit_scale * pictures(images) @ direction(text),
             facts=clip.facts,
-            complaint=clip.complaint,
+            complaints=clip.complaints,
         )
 
     def measure(self, measurand: Measurand) -> Measurement:
@@ -113,19 +113,20 @@ class Janus(ClipMetric):
         if self.by == "model" or measurand.truth is None:
             return self._by_model(measurand)
         asset = _features(lambda cameras, background: measurand.render(cameras, background).rgb[None])[0]
-        modes = [_compare(asset, mode) for mode in _features(measurand.truth.images)]
-        return min(modes, key=lambda each: each.mismatch).measurement()
+        modes = _features(measurand.truth.images)
+        # The mode of which each view of the asset resembles some view most.
+        return _by_truth(asset, min(modes, key=lambda mode: float(_differences(asset, mode).mean())))
 
     def _by_model(self, measurand: Measurand) -> Measurement:
         scorer = self.scorer(measurand.gaussians.device)
         texts = [f"{side} view of {measurand.prompt}" for side in SIDES]
-        cameras = self.protocol.ring(self.views, self.elevation_deg)
         logits = []
-        for one in cameras.parts(1):
+        for one in self.protocol.ring(self.views, self.elevation_deg).parts(1):
             images = measurand.render(one, self.protocol.backgrounds(1)).rgb.detach().float().clamp(0, 1)
-            logits.append(torch.cat([self._score(scorer, images, text) for text in texts]))
-        fronts = torch.stack(logits).detach().double().cpu().softmax(dim=1)[:, 0]
-        self.require_finite(fronts)
+            logits.append(torch.cat([self.scores(scorer, images, text) for text in texts]))
+        fronts = torch.stack(logits).softmax(dim=1)[:, 0]
+        if not fronts.isfinite().all():
+            raise self.failure("it returns NaN or infinity")
         shown = {
             "views": self.views,
             "elevations_deg": [float(self.elevation_deg)],
@@ -140,88 +141,63 @@ class Janus(ClipMetric):
             # The probability that each view is a front, from azimuth 0 on.
             "views": [round(float(each), 6) for each in fronts],
         }
-        complaint = scorer.complaint(texts[0])
-        warnings = () if complaint is None else (complaint,)
+        warnings = scorer.complaints(texts[0])
         lowest, highest = fronts.min(), fronts.max()
         if highest - lowest < LEAST_CONTRAST:
-            return Measurement({}, _none("the model sees no side as the front", record), warnings)
+            return replace(_none("the model sees no side as the front", record), warnings=warnings)
         heights = (fronts - lowest) / (highest - lowest)
         away = torch.arange(self.views) * (360.0 / self.views)
         others = heights.roll(-int(heights.argmax()))[(away >= APART_DEG) & (away <= 360 - APART_DEG)]
         is_front = heights >= HALF
-        numbers = {
-            "janus": float(others.max()),
-            "janus_fronts": float((is_front & ~is_front.roll(1)).sum()),
-        }
-        return Measurement(numbers, _records(numbers, record), warnings)
+        count = (is_front & ~is_front.roll(1)).sum()
+        return replace(_measured(others.max(), count, record), warnings=warnings)
 
 
-def _none(reason: str, record: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the records for an asset without a number."""
-    return {"janus": {"value": None, "reason": reason, **record}}
+def _none(reason: str, record: dict[str, Any]) -> Measurement:
+    """Return the record of an asset without a number."""
+    return Measurement({}, {"janus": {"value": None, "reason": reason, **record}})
 
 
-def _records(numbers: dict[str, float], record: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    return {name: {"value": value, **record} for name, value in numbers.items()}
+def _measured(janus: Tensor, fronts: Tensor, record: dict[str, Any]) -> Measurement:
+    numbers = {"janus": float(janus), "janus_fronts": float(fronts)}
+    return Measurement(numbers, {name: {"value": value, **record} for name, value in numbers.items()})
 
 
-@dataclass(frozen=True)
-class _Comparison:
-    """The views of an asset, compared with those of one mode of the truth."""
-
-    likeness: Float[Tensor, "v v"]  # of each view of the asset to each true one; rows have the sum 1
-    expected: Float[Tensor, "v"]  # how often the true object shows each side
-    mismatch: float  # mean squared difference to the most similar true view
-    error: float  # the same after the projection
-    spread: float  # mean squared difference between two true views
-
-    def measurement(self) -> Measurement:
-        """Return the two numbers with their record."""
-        settings = {"views": VIEWS, "elevation_deg": ELEVATION_DEG, "fov_y_deg": FOV_DEG, "size": SIZE}
-        shown = self.likeness.sum(dim=0)
-        views = {
-            # For each view of the asset, from azimuth 0 on, the azimuth of the true view that it looks like.
-            "looks_like_deg": [360.0 / VIEWS * int(best) for best in self.likeness.argmax(dim=1)],
-            # For each true view, from azimuth 0 on, how often it is shown, and how often it should be.
-            "shown": [round(float(count), 4) for count in shown],
-            "expected": [round(float(count), 4) for count in self.expected],
-            "error": self.error,
-            "spread": self.spread,
-        }
-        record = {"protocol": {"name": "truth", **settings}, "views": views}
-        if self.spread < LEAST_SPREAD:
-            reason = "the true object looks the same from all sides, so it has no front"
-            return Measurement({}, _none(reason, record))
-        numbers = {
-            "janus": float(0.5 * (shown - self.expected).abs().sum() / VIEWS),
-            "janus_fronts": float((_by_quarters(shown) / _by_quarters(self.expected)).max().round()),
-        }
-        return Measurement(numbers, _records(numbers, record))
-
-
-def _by_quarters(counts: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
-    """Return the sums over the quarter turns that begin at each view."""
-    return torch.stack([counts.roll(-first)[: VIEWS // 4].sum() for first in range(VIEWS)])
-
-
-def _compare(asset: Float[Tensor, "v p"], true: Float[Tensor, "v p"]) -> _Comparison:
-    pixels = true.shape[1]
+def _by_truth(asset: Float[Tensor, "v p"], true: Float[Tensor, "v p"]) -> Measurement:
+    """Return both numbers for the features of an asset and of the true object."""
     centre = true.mean(dim=0)
     _, sizes, directions = torch.linalg.svd(true - centre, full_matrices=False)
     directions = directions[sizes > LEAST_DIRECTION * sizes.max()]
     ours, theirs = (asset - centre) @ directions.T, (true - centre) @ directions.T
+    pixels = true.shape[1]
     differences = torch.cdist(ours, theirs).square() / pixels
     among_true = torch.cdist(theirs, theirs).square() / pixels
     spread = float(among_true.sum()) / (VIEWS * (VIEWS - 1))
     error = float(differences.min(dim=1).values.mean())
     noise = max(NOISE * error, LEAST_NOISE * spread, torch.finfo(torch.float64).tiny)
-    return _Comparison(
-        likeness=(-differences / noise).softmax(dim=1),
-        expected=(-among_true / noise).softmax(dim=1).sum(dim=0),
-        mismatch=float(torch.cdist(asset, true).square().min(dim=1).values.mean()) / pixels,
-        error=error,
-        spread=spread,
-    )
+    # How often the asset shows each side, and how often the true object does.
+    shown = (-differences / noise).softmax(dim=1).sum(dim=0)
+    expected = (-among_true / noise).softmax(dim=1).sum(dim=0)
+    settings = {"views": VIEWS, "elevation_deg": ELEVATION_DEG, "fov_y_deg": FOV_DEG, "size": SIZE}
+    record = {
+        "protocol": {"name": "truth", **settings},
+        # For each view of the asset, from azimuth 0 on, the azimuth of the true view that it looks like.
+        "views": {"looks_like_deg": [360.0 / VIEWS * int(best) for best in differences.argmin(dim=1)]},
+    }
+    if spread < LEAST_SPREAD:
+        return _none("the true object looks the same from all sides, so it has no front", record)
+    repeated = 0.5 * (shown - expected).abs().sum() / VIEWS
+    return _measured(repeated, (_by_quarters(shown) / _by_quarters(expected)).max().round(), record)
+
+
+def _differences(asset: Float[Tensor, "v p"], true: Float[Tensor, "v p"]) -> Float[Tensor, "v"]:
+    """Return the squared difference between each view of an asset and the most similar true view."""
+    return torch.cdist(asset, true).square().min(dim=1).values
+
+
+def _by_quarters(counts: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+    """Return the sums over the quarter turns that begin at each view."""
+    return torch.stack([counts.roll(-first)[: VIEWS // 4].sum() for first in range(VIEWS)])
 
 
 def _features(images: Callable[[Cameras, Tensor], Tensor]) -> Float[Tensor, "m v p"]:

@@ -12,12 +12,12 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
 from cadam3d.core.cameras import Cameras, orbit
-from cadam3d.core.checks import require, require_choice, require_whole
+from cadam3d.core.checks import require, require_choice, require_range, require_whole
 from cadam3d.core.pictures import PictureSettings
 from cadam3d.core.rendering import RenderFn, RenderOutput
 
@@ -30,14 +30,6 @@ MARGIN = 0.1  # around a cropped object, as a share of its longer side
 PROMPT = "{}"  # the place of the prompt in a text
 
 
-@dataclass(frozen=True)
-class ModelName:
-    """A model that a protocol names."""
-
-    id: str  # OWNER/NAME on the Hugging Face hub
-    revision: str | None  # a commit on the hub; None = the newest
-
-
 @dataclass(frozen=True, kw_only=True)
 class Protocol(PictureSettings, ABC):
     """Views, pictures, text and models of an evaluation. The subclasses place the cameras."""
@@ -47,30 +39,15 @@ class Protocol(PictureSettings, ABC):
     name: str
     crop: str  # before the preprocessing of the model: "none", or "object" for a square around it
     text: str  # what the picture is compared with; {} is the prompt
-    # Name of a scorer, such as "clip", to None or a mapping with the keys "id" and "revision".
-    models: Mapping[str, Any]
+    # From the name of a scorer, such as "clip", to the id of a model on the hub and its revision, a commit or
+    # None for the newest.
+    models: Mapping[str, Mapping[str, str | None] | None]
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.name != "", "protocol.name", expected="a name", got=self.name, example="protocol=paper")
         require_choice("protocol.crop", self.crop, CROPS)
-        require(
-            self.text.count(PROMPT) == 1,
-            "protocol.text",
-            expected="a text with {} once, where the prompt goes",
-            got=self.text,
-            example="protocol.text='\"a DSLR photo of {}\"'",
-        )
-        for scorer, model in self.models.items():
-            is_named = isinstance(model, Mapping) and set(model) == {"id", "revision"}
-            is_named = is_named and isinstance(model["id"], str) and isinstance(model["revision"], str | None)
-            require(
-                model is None or is_named,
-                f"protocol.models.{scorer}",
-                expected="the id and the revision of a model, or null",
-                got=model,
-                example=f"'protocol.models.{scorer}={{id:OWNER/NAME,revision:null}}'",
-            )
+        is_text = self.text.count(PROMPT) == 1
+        require(is_text, "protocol.text", expected=f"a text with {PROMPT} once", got=self.text)
 
     @cached_property
     @abstractmethod
@@ -90,11 +67,6 @@ class Protocol(PictureSettings, ABC):
         """Return the text with which the pictures are compared."""
         return self.text.replace(PROMPT, prompt)
 
-    def model(self, scorer: str) -> ModelName | None:
-        """Return the model that the protocol names for a scorer; None if it names none."""
-        named = self.models.get(scorer)
-        return None if named is None else ModelName(**named)
-
     def images(self, render: RenderFn) -> Iterator[Float[Tensor, "v h w 3"]]:
         """Yield the pictures of the asset that ``render`` shows, in [0, 1], a few views at a time."""
         for some in self.cameras.parts(VIEWS_AT_ONCE):
@@ -110,11 +82,9 @@ class Protocol(PictureSettings, ABC):
         images = output.rgb.detach().float().clamp(0, 1)
         if self.crop == "none":
             return images
+        fill = self.backgrounds(1)[0].to(images)
         pairs = zip(images, output.alpha.detach(), strict=True)
-        return torch.stack([_around_object(image, alpha, self._fill(image)) for image, alpha in pairs])
-
-    def _fill(self, image: Tensor) -> Float[Tensor, "3"]:
-        return self.backgrounds(1)[0].to(image)
+        return torch.stack([_around_object(image, alpha, fill) for image, alpha in pairs])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,20 +137,12 @@ class SphereProtocol(Protocol):
         require_whole("protocol.subdivisions", self.subdivisions, low=0, high=4)
         require_whole("protocol.rounds", self.rounds, low=0, high=100)
         for each in self.other_fovs_y_deg:
-            is_angle = isinstance(each, int | float) and 0 < each < 180
-            example = "'protocol.other_fovs_y_deg=[45,30]'"
-            require(
-                is_angle,
-                "protocol.other_fovs_y_deg",
-                expected="angles in (0, 180)",
-                got=each,
-                example=example,
-            )
+            require_range("protocol.other_fovs_y_deg", each, above=0, below=180)
 
     @cached_property
     def cameras(self) -> Cameras:
         """Return the cameras: all fields of view of the first vertex, then those of the second, and so on."""
-        x, y, z = self._vertices.unbind(dim=1)
+        x, y, z = torch.tensor(self._mesh.vertices, dtype=torch.float64).unbind(dim=1)
         azimuth, elevation = torch.rad2deg(torch.atan2(y, x)), torch.rad2deg(torch.asin(z.clamp(-1, 1)))
         fovs = torch.tensor([float(each) for each in (self.fov_y_deg, *self.other_fovs_y_deg)])
         azimuth, elevation = (each.repeat_interleave(len(fovs)).float() for each in (azimuth, elevation))
@@ -189,9 +151,12 @@ class SphereProtocol(Protocol):
 
     def aggregate(self, values: Float[Tensor, "v"], *, less_is_better: bool) -> float:
         """Return the smoothed value of the best vertex."""
-        by_vertex = values.double().reshape(len(self._vertices), -1)
+        by_vertex = values.double().reshape(len(self._mesh.vertices), -1)
         field = by_vertex.amin(dim=1) if less_is_better else by_vertex.amax(dim=1)
-        near = self._nearness
+        # Each vertex is a neighbour of itself.
+        near = torch.eye(len(field), dtype=torch.float64)
+        one, other = torch.tensor(self._mesh.edges_unique).T
+        near[one, other] = near[other, one] = 1
         for _ in range(self.rounds):
             field = near @ field / near.sum(dim=1)
         return float(_best(field, less_is_better))
@@ -202,29 +167,14 @@ class SphereProtocol(Protocol):
         return False
 
     @cached_property
-    def _mesh(self) -> tuple[Float[Tensor, "p 3"], Int[Tensor, "f 3"]]:
-        """Return the vertices on the unit sphere, and the triangles.
+    def _mesh(self) -> Any:
+        """Return the sphere as a mesh of trimesh.
 
-        The sphere stands on an edge: the poles are in the middle of two edges of the undivided icosahedron.
+        It stands on an edge: the poles are in the middle of two edges of the undivided icosahedron.
         """
         from trimesh.creation import icosphere  # slow to import
 
-        mesh = icosphere(subdivisions=self.subdivisions)
-        return torch.tensor(mesh.vertices, dtype=torch.float64), torch.tensor(mesh.faces, dtype=torch.long)
-
-    @property
-    def _vertices(self) -> Float[Tensor, "p 3"]:
-        return self._mesh[0]
-
-    @cached_property
-    def _nearness(self) -> Float[Tensor, "p p"]:
-        """Return 1 for a vertex with itself and with each of its neighbours, else 0."""
-        vertices, faces = self._mesh
-        near = torch.eye(len(vertices), dtype=torch.float64)
-        for a, b in ((0, 1), (1, 2), (2, 0)):
-            near[faces[:, a], faces[:, b]] = 1
-            near[faces[:, b], faces[:, a]] = 1
-        return near
+        return icosphere(subdivisions=self.subdivisions)
 
 
 def _best(values: Tensor, less_is_better: bool) -> Tensor:
@@ -240,14 +190,11 @@ def _around_object(
         return image
     (top, bottom), (left, right) = ((int(each[0]), int(each[-1]) + 1) for each in (rows, columns))
     side = round(max(bottom - top, right - left) * (1 + 2 * MARGIN))
-    square = fill.expand(side, side, 3).clone()
     # The square may reach beyond the image, where there is only background.
-    first_row, first_column = (top + bottom - side) // 2, (left + right - side) // 2
     height, width = alpha.shape
-    inside_rows = slice(max(first_row, 0), min(first_row + side, height))
-    inside_columns = slice(max(first_column, 0), min(first_column + side, width))
-    part = image[inside_rows, inside_columns]
-    row, column = inside_rows.start - first_row, inside_columns.start - first_column
-    square[row : row + part.shape[0], column : column + part.shape[1]] = part
+    wide = fill.repeat(height + 2 * side, width + 2 * side, 1)
+    wide[side:-side, side:-side] = image
+    first_row, first_column = (top + bottom + side) // 2, (left + right + side) // 2
+    square = wide[first_row : first_row + side, first_column : first_column + side]
     resized = interpolate(square.permute(2, 0, 1)[None], size=(height, width), mode="bicubic", antialias=True)
     return resized[0].permute(1, 2, 0).clamp(0, 1)

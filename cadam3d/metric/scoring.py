@@ -19,7 +19,7 @@ from cadam3d.core.memory import is_out_of_memory
 from cadam3d.core.number import Number
 from cadam3d.io.pretrained import short
 from cadam3d.metric.base import Measurand, Measurement, Metric
-from cadam3d.metric.protocol import ModelName, Protocol
+from cadam3d.metric.protocol import Protocol
 from cadam3d.metric.transformer import TransformerFolder, TransformerSource
 
 LEVEL = 0.95  # of the interval
@@ -33,8 +33,8 @@ class Scorer:
     score: Callable[[Tensor, str], Tensor]
     # What the record of a number says about the model: "model", "revision", "weights_sha256" and so on.
     facts: Mapping[str, Any] = field(default_factory=dict)
-    # From a text to a warning about it, such as that it is too long for the model; None if there is none.
-    complaint: Callable[[str], str | None] = lambda text: None
+    # From a text to warnings about it, such as that it is too long for the model.
+    complaints: Callable[[str], tuple[str, ...]] = lambda text: ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,35 +62,28 @@ class ScoreMetric(Metric):
         scorer = self.scorer(measurand.gaussians.device)
         text = self.protocol.text_of(measurand.prompt)
         values = self.values(measurand, scorer, text)
-        self.require_finite(values)
-        complaint = scorer.complaint(text)
-        return replace(
-            self.measurement(values, text, scorer.facts), warnings=() if complaint is None else (complaint,)
-        )
+        if not values.isfinite().all():
+            raise self.failure("it returns NaN or infinity")
+        return replace(self.measurement(values, text, scorer.facts), warnings=scorer.complaints(text))
 
     def values(self, measurand: Measurand, scorer: Scorer, text: str) -> Float[Tensor, "v"]:
         """Return the score of every view of the protocol."""
-        scores = [self._score(scorer, images, text) for images in self.protocol.images(measurand.render)]
-        return torch.cat([score.detach().double().cpu() for score in scores])
+        scores = [self.scores(scorer, images, text) for images in self.protocol.images(measurand.render)]
+        return torch.cat(scores)
 
-    def _score(self, scorer: Scorer, images: Float[Tensor, "v h w 3"], text: str) -> Float[Tensor, "v"]:
+    def scores(self, scorer: Scorer, images: Float[Tensor, "v h w 3"], text: str) -> Float[Tensor, "v"]:
+        """Return the score of each image. Raises ``UserError`` if the model fails or returns no numbers."""
         try:
-            return scorer.score(images, text)
+            return scorer.score(images, text).detach().double().cpu()
         # Models and the preparation of their inputs raise almost any exception, which must not end a run.
         except Exception as error:
-            if is_out_of_memory(error) or isinstance(error, UserError):
+            if is_out_of_memory(error):
                 raise
-            raise UserError(
-                f"metric.{self.number.name}: the model cannot score this prompt ({short(error)}). "
-                "Try: another model"
-            ) from error
+            raise self.failure(short(error)) from error
 
-    def require_finite(self, values: Tensor) -> None:
-        """Raise ``UserError`` if a model has returned something other than numbers."""
-        if not values.isfinite().all():
-            raise UserError(
-                f"metric.{self.number.name}: its model returns NaN or infinity. Try: another model"
-            )
+    def failure(self, reason: str) -> UserError:
+        """Return the error for a model that cannot score an asset."""
+        return UserError(f"metric.{self.number.name}: the model cannot score this prompt ({reason})")
 
     def measurement(
         self, values: Float[Tensor, "v"], text: str | None, facts: Mapping[str, Any]
@@ -149,25 +142,20 @@ class ModelMetric(ScoreMetric):
 
     def source(self) -> TransformerSource:
         """Return the place of the model. Raises ``UserError`` if neither metric nor protocol names one."""
-        named = self.protocol.model(self.kind) if self.model is None else ModelName(self.model, None)
+        named = self.protocol.models.get(self.kind)
+        key = f"{self.node}.model"
+        if self.model is not None:
+            return TransformerSource(key, self.model, self.revision)
         if named is None:
-            raise UserError(
-                f"{self.node}.model: protocol={self.protocol.name} names no model for this metric. "
-                f"Try: {self.node}.model=DIR"
-            )
-        revision = named.revision if self.revision is None else self.revision
-        return TransformerSource(self.node, named.id, revision)
+            raise UserError(f"{key}: protocol={self.protocol.name} names no model for this metric")
+        revision = named["revision"] if self.revision is None else self.revision
+        return TransformerSource(key, named["id"], revision)
 
 
-def cut_off(lost: int, longest: int) -> str | None:
-    """Return a warning about a text of which ``lost`` tokens are not read; None if all of them are read."""
-    if lost <= 0:
-        return None
-    verb = "are" if lost > 1 else "is"
-    return (
-        f"the model reads {longest} tokens, so the last {lost} of the prompt {verb} not scored. "
-        "Try: a shorter prompt"
-    )
+def too_long(tokens: int, longest: int) -> tuple[str, ...]:
+    """Return a warning about a text if it has more tokens than the ``longest`` that the model reads."""
+    read = f"the model reads {longest} tokens, and the others of the {tokens} in the text are not scored"
+    return (f"{read}. Try: a shorter prompt",) if tokens > longest else ()
 
 
 def interval_record(low: float, high: float, of: str) -> dict[str, Any]:

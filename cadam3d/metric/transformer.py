@@ -5,91 +5,80 @@ weights in the format of safetensors are read. Other formats can run code when t
 """
 
 import hashlib
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache
-from importlib.util import find_spec
+from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
-from cadam3d.core.checks import require
+from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
-from cadam3d.io.jsonl import read_json
-from cadam3d.io.pretrained import fetch_file, short
+from cadam3d.core.memory import is_out_of_memory
+from cadam3d.io.pretrained import require_extra, short
 
 CONFIG = "config.json"
 WEIGHTS = "model.safetensors"
 SHARDS = "model.safetensors.index.json"
 # The files that a model needs; weights in other formats are not downloaded.
 NEEDED = ("*.json", "*.txt", WEIGHTS, "model-*.safetensors")
-EXTRA = ("transformers", "safetensors", "huggingface_hub")
-BLOCK = 1 << 20  # bytes that are hashed at once
+KEPT = 3  # models in memory
+
+Model = TypeVar("Model")
 
 
 @dataclass(frozen=True)
 class TransformerSource:
     """The place to search for a model."""
 
-    # The node in the configuration, such as "metric.clip_score", with which messages begin. It is not
-    # compared, because the models of several metrics may be the same.
+    # The setting that names the model, such as "metric.clip_score.model", with which messages begin. It is
+    # not compared, because the models of several metrics may be the same.
     key: str = field(compare=False)
     model: str  # a folder, or OWNER/NAME on the Hugging Face hub
-    revision: str | None  # on the hub; None = the newest
-    setting: str = field(default="model", compare=False)  # below the node, the setting that names the model
-    needed: Sequence[str] = NEEDED  # patterns of the files that are downloaded
-
-    @property
-    def name(self) -> str:
-        """Return the whole name of the setting that names the model."""
-        return f"{self.key}.{self.setting}"
-
-    def __post_init__(self) -> None:
-        require(
-            self.model.strip() != "",
-            self.name,
-            expected="a folder, an id on the hub or null",
-            got=self.model,
-            example=f"{self.name}=null",
-        )
+    revision: str | None = None  # on the hub; None = the newest
+    needed: tuple[str, ...] = NEEDED  # patterns of the files that are downloaded
 
     def find(self) -> "TransformerFolder":
         """Find the folder of the model, after a download if it is on the hub and not on this disk.
 
-        Raises ``UserError``, which says what to download and what to type, if it cannot be found.
+        Raises ``UserError`` if it cannot be found.
         """
-        missing = [name for name in EXTRA if find_spec(name) is None]
-        if missing:
-            raise UserError(f"{self.key}: needs {', '.join(missing)}. Try: pip install 'cadam3d[diffusers]'")
+        require_extra(self.key)
         folder = Path(self.model).expanduser()
+        if (folder / CONFIG).is_file():
+            return TransformerFolder(self, folder, None)
         if folder.exists() or self.model.count("/") != 1 or self.model[0] in "./~":
-            if (folder / CONFIG).is_file():
-                return TransformerFolder(self, folder, None)
-            reason = f"it has no {CONFIG}" if folder.is_dir() else "there is no folder of this name"
-            raise UserError(
-                f"{self.name}: expected a folder with a model of transformers, got {self.model!r} "
-                f"({reason}). Try: {self.name}=null"
-            )
-        folder = self._downloaded()
-        # In the cache of the hub, the name of a snapshot is its commit.
+            expected = f"a folder with the {CONFIG} of a model, or OWNER/NAME on the hub"
+            raise fail(self.key, expected=expected, got=self.model)
+        folder = downloaded(self.key, self.model, self.revision, self.needed)
         return TransformerFolder(self, folder, folder.name)
 
-    def _downloaded(self) -> Path:
-        config, reason, can_ask = fetch_file(self.model, CONFIG, self.revision, True)
-        try:
-            if config is not None:
-                return _snapshot(self.model, self.revision, self.needed, can_ask)
-        # Also the errors of the hub, which are errors of the operating system.
-        except (OSError, ValueError) as error:
-            reason = short(error)
-        folder = f"models/{self.model.split('/')[1]}"
-        revision = "" if self.revision is None else f"--revision {self.revision} "
-        only = " ".join(f"--include '{pattern}'" for pattern in self.needed)
-        raise UserError(
-            f"{self.name}: no model is available. {self.model}: {reason}. Try, with a network connection: "
-            f"hf download {self.model} {revision}--local-dir {folder} {only}. Then: {self.name}={folder}"
+
+@cache  # every job of a sweep needs the model, and asking the hub takes time
+def downloaded(key: str, name: str, revision: str | None, needed: tuple[str, ...]) -> Path:
+    """Return the folder with the files of a model on the hub that match ``needed``.
+
+    The name of the folder is the commit. Files that are not on this disk are downloaded. Raises ``UserError``
+    if that is impossible.
+    """
+    from huggingface_hub import constants, snapshot_download
+
+    try:
+        offline = constants.HF_HUB_OFFLINE
+        found = snapshot_download(
+            name, revision=revision, allow_patterns=list(needed), local_files_only=offline
         )
+    # The errors of the hub are errors of the operating system.
+    except (OSError, ValueError) as error:
+        folder = f"models/{name.split('/')[1]}"
+        files = " ".join(f"--include '{pattern}'" for pattern in needed)
+        raise UserError(
+            f"{key}: {name} is not available ({short(error)}). Try, with a network connection: "
+            f"hf download {name} --local-dir {folder} {files}. Then: {key}={folder}"
+        ) from error
+    return Path(found)
 
 
 @dataclass(frozen=True)
@@ -100,21 +89,23 @@ class TransformerFolder:
     folder: Path
     revision: str | None  # the commit on the hub; None for a folder of the user
 
-    def config(self) -> dict[str, Any]:
-        """Return the configuration of the model. Raises ``UserError`` if it cannot be read."""
-        return self._content(CONFIG)
+    def entries(self, name: str = CONFIG) -> dict[str, Any]:
+        """Return the content of a JSON file of the model. Raises ``UserError`` if it cannot be read."""
+        try:
+            return json.loads((self.folder / name).read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise self.damaged(f"{name}: {short(error)}") from error
 
     def check(self) -> None:
-        """Raise ``UserError`` if a file is missing or incomplete. Only headers of weights are read."""
+        """Raise ``UserError`` if weights are missing or incomplete. Only their headers are read."""
         from safetensors import SafetensorError, safe_open
 
-        self.config()
         for file in self.weights():
             try:
                 with safe_open(file, framework="pt"):
                     pass
             except (SafetensorError, OSError) as error:
-                raise self.damaged(f"{file.name} is incomplete or damaged ({short(error)})") from error
+                raise self.damaged(f"{file.name}: {short(error)}") from error
 
     def weights(self) -> list[Path]:
         """Return the files of the weights, in the order of their names.
@@ -123,8 +114,7 @@ class TransformerFolder:
         """
         names = [WEIGHTS]
         if not (self.folder / WEIGHTS).is_file() and (self.folder / SHARDS).is_file():
-            shards = self._content(SHARDS).get("weight_map", {})
-            names = sorted({str(name) for name in shards.values()})
+            names = sorted(set(self.entries(SHARDS)["weight_map"].values()))
         for name in names:
             if not (self.folder / name).is_file():
                 raise self.damaged(f"it has no {name}, and no other format is read, since it could run code")
@@ -139,65 +129,43 @@ class TransformerFolder:
 
         self.weights()
         transformers.utils.logging.disable_progress_bar()
-        try:
-            model, report = kind.from_pretrained(
-                self.folder,
-                use_safetensors=True,
-                dtype=dtype,
-                output_loading_info=True,
-                trust_remote_code=False,
-            )
-        except Exception as error:
-            raise self._unreadable(kind.__name__, error) from error
+        model, report = self.read(kind, use_safetensors=True, dtype=dtype, output_loading_info=True)
         # With weights of another model, transformers draws the missing ones at random and goes on.
         if missing := sorted(report["missing_keys"]):
             raise self.damaged(f"it is not a {kind.__name__}: {missing[0]} is missing")
         return model.requires_grad_(False).eval()
 
-    def read(self, kind: Any) -> Any:
-        """Return a tokenizer or image processor from the files of the model, of a class of transformers."""
+    def read(self, kind: Any, **options: Any) -> Any:
+        """Return what a class of transformers reads from the folder, such as a tokenizer."""
         try:
-            return kind.from_pretrained(self.folder, trust_remote_code=False)
+            return kind.from_pretrained(self.folder, trust_remote_code=False, **options)
+        # A damaged file makes its reader raise almost anything.
         except Exception as error:
-            raise self._unreadable(kind.__name__, error) from error
+            if is_out_of_memory(error):
+                raise
+            raise self.damaged(f"its {kind.__name__} cannot be loaded ({short(error)})") from error
 
     def facts(self) -> dict[str, Any]:
         """Return what the record of a number says about the model."""
-        return {
-            "model": self.source.model,
-            "revision": self.revision,
-            "weights_sha256": sha256_of(self.weights()),
-        }
+        return model_facts(self.source.model, self.revision, self.weights())
 
     def damaged(self, problem: str) -> UserError:
         """Return the error for a model that was found but cannot be used."""
-        key, where = self.source.name, self.source.model
-        return UserError(f"{key}: {where} cannot be used: {problem}. Try: another {key}")
-
-    def _content(self, name: str) -> dict[str, Any]:
-        """Return the content of a JSON file of the model."""
-        try:
-            entries = read_json(self.folder / name)
-        except UserError as error:
-            raise self.damaged(str(error).partition(" Try: ")[0]) from error
-        if not isinstance(entries, dict):
-            raise self.damaged(f"{name} has no names with values")
-        return entries
-
-    def _unreadable(self, what: str, error: Exception) -> BaseException:
-        if isinstance(error, torch.OutOfMemoryError):
-            return error
-        return self.damaged(f"its {what} cannot be loaded ({short(error)})")
+        return UserError(f"{self.source.key}: {self.source.model} cannot be used: {problem}")
 
 
-@cache  # every job of a sweep needs the model, and asking the hub takes time
-def _snapshot(name: str, revision: str | None, needed: Sequence[str], can_ask: bool) -> Path:
-    """Return the folder of a model of the hub, after a download of what is not on this disk."""
-    from huggingface_hub import constants, snapshot_download
+def model_facts(model: str, revision: str | None, weights: Sequence[Path]) -> dict[str, Any]:
+    """Return what the record of a number says about a model with these files of weights."""
+    return {"model": model, "revision": revision, "weights_sha256": sha256_of(weights)}
 
-    offline = constants.HF_HUB_OFFLINE or not can_ask
-    folder = snapshot_download(name, revision=revision, allow_patterns=list(needed), local_files_only=offline)
-    return Path(folder)
+
+@lru_cache(maxsize=KEPT)
+def kept(load: Callable[..., Model], *which: Any) -> Model:
+    """Return ``load(*which)``. Several metrics and all jobs of a sweep load each model once.
+
+    With the hash of the weights in ``which``, a file that has changed is loaded again.
+    """
+    return load(*which)
 
 
 def sha256_of(files: Sequence[Path]) -> str:
@@ -206,21 +174,15 @@ def sha256_of(files: Sequence[Path]) -> str:
     For one file it is the SHA-256 that ``sha256sum`` prints and the hub shows. For several it is the SHA-256
     of the lines that ``sha256sum`` prints for them, in the order of their names.
     """
+    states = [(file.resolve(), file.stat()) for file in files]
+    hashes = [_hashed(file, state.st_size, state.st_mtime_ns) for file, state in states]
     if len(files) == 1:
-        return _hash_of_file(files[0])
-    lines = [f"{_hash_of_file(file)}  {file.name}\n" for file in sorted(files, key=lambda each: each.name)]
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
-
-
-def _hash_of_file(file: Path) -> str:
-    state = file.stat()
-    return _hashed(file.resolve(), state.st_size, state.st_mtime_ns)
+        return hashes[0]
+    lines = sorted((file.name, digest) for file, digest in zip(files, hashes, strict=True))
+    return hashlib.sha256("".join(f"{digest}  {name}\n" for name, digest in lines).encode()).hexdigest()
 
 
 @cache  # some files have gigabytes, and several metrics of every job of a sweep need the hash
 def _hashed(file: Path, _size: int, _changed: int) -> str:
-    digest = hashlib.sha256()
     with file.open("rb") as stream:
-        while block := stream.read(BLOCK):
-            digest.update(block)
-    return digest.hexdigest()
+        return hashlib.file_digest(stream, "sha256").hexdigest()

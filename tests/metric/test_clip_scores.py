@@ -116,14 +116,6 @@ def test_r_precision_is_the_share_of_views_that_find_their_prompt(
     assert 0 <= record["interval"]["low"] <= hits.mean() <= record["interval"]["high"] <= 1
 
 
-def test_texts_that_the_model_cannot_tell_apart_are_not_found(make, measurand, tmp_path):
-    long = "a cat " * 80
-    (tmp_path / "prompts.txt").write_text(f"{long} one\n{long} two\n")
-    metric = make(ClipRPrecision, prompts=str(tmp_path / "prompts.txt"))
-    measured = metric.measure(replace(measurand, prompt=f"{long} one"))
-    assert measured.numbers["clip_r_precision"] == 0
-
-
 def test_the_record_says_how_a_number_came_about(make, measurand, clip_folder):
     record = make(ClipScore).measure(measurand).details["clip_score"]
     assert json.loads(json.dumps(record)) == record
@@ -214,11 +206,8 @@ def test_a_model_of_the_hub_has_its_commit_in_the_record(make, measurand, clip_f
         asked.append((name, options["revision"]))
         return str(snapshot)
 
-    monkeypatch.setattr(
-        "huggingface_hub.hf_hub_download", lambda *names, **options: str(snapshot / "config.json")
-    )
     monkeypatch.setattr("huggingface_hub.snapshot_download", download)
-    transformer._snapshot.cache_clear()
+    transformer.downloaded.cache_clear()
     record = make(ClipScore, model=None).measure(measurand).details["clip_score"]
     assert asked == [("openai/clip", "abc")]
     assert (record["model"], record["revision"]) == ("openai/clip", "0123456789abcdef")
@@ -257,7 +246,7 @@ def cut_short(folder):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (without("config.json"), "has no config.json"),
+        (without("config.json"), "expected a folder with the config.json"),
         (without("preprocessor_config.json"), "cannot be loaded"),
         (only_pickled, "it could run code"),
         (of_another_kind, "not a CLIP model"),
@@ -273,12 +262,9 @@ def test_a_damaged_model_is_one_message(make, measurand, clip_folder, tmp_path, 
     assert str(caught.value).startswith("metric.clip_score.model: ")
 
 
-@pytest.mark.parametrize(
-    ("model", "message"),
-    [("", "expected a folder"), ("~/nothing/here", "there is no folder"), ("models", "there is no folder")],
-)
-def test_a_model_that_is_no_folder_and_no_id_is_refused(make, measurand, model, message, monkeypatch):
-    with pytest.raises(UserError, match=message):
+@pytest.mark.parametrize("model", ["", "~/nothing/here", "models"])
+def test_a_model_that_is_no_folder_and_no_id_is_refused(make, measurand, model):
+    with pytest.raises(UserError, match=r"metric\.clip_score\.model: expected a folder"):
         make(ClipScore, model=model).measure(measurand)
 
 

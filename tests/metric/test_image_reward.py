@@ -92,7 +92,7 @@ def test_every_view_is_scored_with_the_text_of_the_protocol(package, folder, cap
 
 def test_files_in_a_folder_are_read_without_a_download(package, folder):
     metric(folder).scorer(torch.device("cpu"))
-    assert package == [(str(folder / "ImageReward.pt"), None, str(folder / "med_config.json"))]
+    assert package == [(str(folder / "ImageReward.pt"), str(folder), str(folder / "med_config.json"))]
 
 
 def test_without_files_the_package_downloads_them_into_its_cache(package, folder, monkeypatch):
@@ -106,7 +106,7 @@ def test_without_files_the_package_downloads_them_into_its_cache(package, folder
     monkeypatch.setattr(image_reward, "_loaded", lambda *arguments: downloaded(package.append(arguments)))
     metric(None).prepare()
     facts = metric(None).scorer(torch.device("cpu")).facts
-    assert package[0][1:4] == ("ImageReward-v1.0", str(cache), None)
+    assert package[0][1:3] == ("ImageReward-v1.0", cache)
     assert facts["weights_sha256"] == hashlib.sha256(b"others").hexdigest()
 
 
@@ -114,7 +114,7 @@ def test_a_long_prompt_is_reported(package, folder):
     words = " ".join(["red"] * 40)
     assert metric(folder).measure(measurand()).warnings == ()
     warning = metric(folder).measure(measurand(words)).warnings[0]
-    assert warning.startswith("the model reads 35 tokens, so the last 8 of the prompt are not scored")
+    assert warning.startswith("the model reads 35 tokens, and the others of the 43")
 
 
 def refusal(model):

@@ -118,9 +118,6 @@ def test_a_picture_without_an_object_is_not_cropped():
         ({"aggregation": "median"}, "protocol.aggregation"),
         ({"views": 0}, "protocol.views"),
         ({"elevations_deg": []}, "protocol.elevations_deg"),
-        ({"models": {"clip": "openai/clip"}}, "protocol.models.clip"),
-        ({"models": {"clip": {"id": "openai/clip"}}}, "protocol.models.clip"),
-        ({"name": ""}, "protocol.name"),
     ],
 )
 def test_wrong_values_are_named(change, message):
