@@ -23,10 +23,10 @@ from cadam3d.study.estimates import (
     Interval,
     count_wins,
     fit_strengths,
+    is_ranked,
     rate_interval,
     sign_test,
     strength_margins,
-    unranked,
 )
 
 SIZES = ((8, 6), (30, 6), (30, 12), (12, 50))
@@ -142,7 +142,7 @@ def strength_coverage(study: Study, simulations: int, seed: int = 0) -> list[flo
     while len(hits) < simulations:
         chosen, other, clusters = study.answers(generator)
         wins = count_wins(chosen, other, len(truth))
-        if not unranked(wins):
+        if is_ranked(wins):
             strengths = fit_strengths(wins)
             hits.append(np.abs(strengths - truth) <= strength_margins(chosen, other, clusters, strengths))
     return (100 * np.mean(hits, axis=0)).tolist()

@@ -2,8 +2,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -12,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.commands.messages import note
 from cadam3d.commands.opened import open_run, renderer
-from cadam3d.core.checks import require_range, require_whole
+from cadam3d.core.checks import fail, require_range, require_whole
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.asset_record import sha256_of
@@ -23,33 +22,25 @@ from cadam3d.io.prompt_files import read_prompts
 from cadam3d.io.reading import read_text
 from cadam3d.io.run_folder import (
     ASSET,
+    claim,
     expanded,
     nearest_existing,
     numbered,
     occupant,
     remove_empty,
-    require_writable,
     setting_word,
     shown,
     typed_path,
 )
 from cadam3d.report.formatting import plural
 from cadam3d.settings.compose import Call
-from cadam3d.study.answers import (
-    RESULTS_KIND,
-    AnswerFile,
-    LeftOut,
-    collect,
-    find_files,
-    read_files,
-)
+from cadam3d.study.answers import AnswerFile, collect, find_files, read_files
 from cadam3d.study.clips import LEAST_VISIBLE, ClipSettings, FilmedTurn, film, ruined
 from cadam3d.study.key import KEY, PAGE, RESULTS, TABLE, Key, read_key, write_key
 from cadam3d.study.rater_page import study_id, study_page
 from cadam3d.study.runs import RunPair, StudyRun, draw_pairs, find_runs, pair_runs, select
 from cadam3d.study.trials import StudyPlan, catch_count, make_plan
 
-LARGEST_PAGE = 100_000_000  # bytes; above this, some mail servers and phones refuse a page
 LARGEST_CONSENT = 1 << 16  # bytes
 CONSENT = """Taking part is voluntary, and you can stop at any time without giving a reason.
 
@@ -61,8 +52,7 @@ def run(cfg: DictConfig, _call: Call) -> None:
     """Write the page and the key of a study of ``runs=``, or evaluate the files in ``answers=``."""
     if (cfg.runs is None) == (cfg.answers is None):
         got = "neither" if cfg.runs is None else "both"
-        line = "cadam3d study --help" if cfg.runs is None else "answers=null"
-        raise UserError(f"runs, answers: expected one of them, got {got}. Try: {line}")
+        raise UserError(f"runs, answers: expected one of them, got {got}. Try: cadam3d study --help")
     if cfg.answers is None:
         _write(cfg)
     else:
@@ -78,21 +68,22 @@ def _write(cfg: DictConfig) -> None:
     # The text that raters read before they begin.
     consent = CONSENT if cfg.consent is None else read_text(expanded(cfg.consent), largest=LARGEST_CONSENT)
     pairs = _pairs(cfg)
-    generator = _generator(cfg.seed, pairs)
+    runs = list(dict.fromkeys(run for pair in pairs for run in pair.runs))
+    # A rater may know this program and guess the seed. The draws also depend on the assets, which a page does
+    # not contain, so that they cannot be repeated from it.
+    generator = Random(f"{cfg.seed} {' '.join(sha256_of(run.folder / ASSET) for run in runs)}")
     pairs = draw_pairs(pairs, cfg.pairs, generator)
-    with _output(cfg) as folder:
-        clips = _film_all(pairs, cfg, settings)
-        plan = _plan(cfg, pairs, clips, generator)
-        frames = [
-            ruined(clips[source.run], settings, number) if source.is_ruined else clips[source.run].frames
-            for number, source in enumerate(plan.sources)
-        ]
-        study = study_id(plan.trials, frames)
-        page = study_page(study, plan.trials, frames, seconds=float(settings.seconds), consent=consent)
-        with replacing(folder / PAGE) as temporary:
-            temporary.write_text(page, encoding="utf-8")
-        write_key(folder / KEY, study, plan, seed=cfg.seed)
-        _print_page(folder, pairs, plan)
+    folder = typed_path(cfg.output)
+    # Without its key, the answers to a study are lost.
+    if found := KEY if os.path.lexists(folder / KEY) else occupant(folder):
+        free = setting_word("output", shown(numbered(folder)))
+        raise UserError(f"output: expected a folder of its own, got one with {found}. Try: {free}")
+    existing = nearest_existing(folder)
+    claim(folder, "output", is_chosen=True)
+    try:
+        _write_page(cfg, settings, consent, pairs, generator, folder)
+    finally:
+        remove_empty(folder, existing)
 
 
 def _settings(cfg: DictConfig) -> ClipSettings:
@@ -112,57 +103,43 @@ def _settings(cfg: DictConfig) -> ClipSettings:
     )
 
 
-def _generator(seed: int, pairs: Sequence[RunPair]) -> Random:
-    """Return what draws the order, the sides and the numbers of the clips.
-
-    A rater may know this program and guess the seed. The draws also depend on the assets, which a page does
-    not contain, so that they cannot be repeated from it.
-    """
-    runs = dict.fromkeys(run for pair in pairs for run in pair.runs)
-    hashes = [sha256_of(run.folder / ASSET) for run in runs]
-    return Random(f"{seed} {' '.join(hashes)}")
-
-
 def _pairs(cfg: DictConfig) -> list[RunPair]:
     """Return all pairs of runs, and print a note if runs are left out."""
     found = find_runs(_texts(cfg.runs), None if cfg.labels is None else _texts(cfg.labels))
     prompts = None if cfg.prompts is None else {each.text for each in read_prompts(str(cfg.prompts))}
-    runs = select(found.runs, None if cfg.arms is None else _texts(cfg.arms), prompts)
+    runs = select(found, None if cfg.arms is None else _texts(cfg.arms), prompts)
     pairs = pair_runs(runs, same_seed=cfg.same_seed)
-    if found.without_asset:
-        note(f"{plural(found.without_asset, 'run')} left no asset and cannot be shown")
     paired = {run for pair in pairs for run in pair.runs}
     if single := [str(shown(run.folder)) for run in runs if run not in paired]:
         note(f"{plural(len(single), 'run')} without a partner in another arm, such as {single[0]}")
     return pairs
 
 
-@contextmanager
-def _output(cfg: DictConfig) -> Iterator[Path]:
-    """Yield the folder of the page, which is removed again if it stays empty.
-
-    Raises ``UserError`` if it cannot be used.
-    """
-    text = str(cfg.output or "")
-    folder = typed_path(text)
-    free = setting_word("output", shown(numbered(folder.with_name(folder.name or "study"))))
-    if not text.strip() or folder.parent == folder:
-        raise UserError(f"output: expected a folder, got {text!r}. Try: output=study")
-    # Without its key, the answers to a study are lost.
-    found = KEY if os.path.lexists(folder / KEY) else occupant(folder) if folder.is_dir() else None
-    if found:
-        raise UserError(f"output: expected a folder of its own, got one with {found}. Try: {free}")
-    existing = nearest_existing(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        require_writable(folder)
-    except OSError as error:
-        reason = error.strerror or error
-        raise UserError(f"output: cannot write to {folder} ({reason}). Try: output=study") from error
-    try:
-        yield folder
-    finally:
-        remove_empty(folder, existing)
+def _write_page(
+    cfg: DictConfig,
+    settings: ClipSettings,
+    consent: str,
+    pairs: Sequence[RunPair],
+    generator: Random,
+    folder: Path,
+) -> None:
+    clips = _film_all(pairs, cfg, settings)
+    plan = _plan(cfg, pairs, clips, generator)
+    frames = [
+        ruined(clips[source.run], settings, number) if source.is_ruined else clips[source.run].frames
+        for number, source in enumerate(plan.sources)
+    ]
+    study = study_id(plan.trials, frames)
+    page = study_page(study, plan.trials, frames, seconds=float(settings.seconds), consent=consent)
+    with replacing(folder / PAGE) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    write_key(folder / KEY, study, plan, seed=cfg.seed)
+    for (one, other), count in sorted(Counter(pair.arms for pair in pairs).items()):
+        print(f"{one} and {other}: {plural(count, 'pair')}")
+    trials, catches = plural(len(plan.trials), "trial"), len(plan.trials) - len(pairs)
+    print(f"{trials}, of which {plural(catches, 'catch trial')}; {len(page) / 1e6:.1f} MB")
+    print(f"for the raters:  {shown(folder / PAGE)}")
+    print(f"keep it secret:  {shown(folder / KEY)}")
 
 
 def _film_all(
@@ -179,32 +156,15 @@ def _film_all(
 
 
 def _plan(
-    cfg: DictConfig, pairs: Sequence[RunPair], clips: dict[StudyRun, FilmedTurn], generator: Random
+    cfg: DictConfig, pairs: Sequence[RunPair], clips: Mapping[StudyRun, FilmedTurn], generator: Random
 ) -> StudyPlan:
     """Return the trials. Raises ``UserError`` if no clip shows enough for a catch trial."""
     catches = catch_count(len(pairs), cfg.catch_share)
     visible = [run for run, clip in clips.items() if clip.visible >= LEAST_VISIBLE]
     if catches and not visible:
-        raise UserError(
-            "backdrop: expected a colour in front of which the objects can be seen, got "
-            f"{list(cfg.backdrop)}: no turntable shows anything. Try: 'backdrop=[0.5,0.5,0.5]'"
-        )
+        expected = "a colour in front of which the objects can be seen"
+        raise fail("backdrop", expected=expected, got=list(cfg.backdrop), example="'backdrop=[0.5,0.5,0.5]'")
     return make_plan(pairs, visible, catches, generator)
-
-
-def _print_page(folder: Path, pairs: Sequence[RunPair], plan: StudyPlan) -> None:
-    met = Counter(pair.arms for pair in pairs)
-    for (one, other), count in sorted(met.items()):
-        print(f"{one} and {other}: {plural(count, 'pair')}")
-    size = (folder / PAGE).stat().st_size
-    catches = len(plan.trials) - len(pairs)
-    print(
-        f"{plural(len(plan.trials), 'trial')}, of which {plural(catches, 'catch trial')}; {size / 1e6:.1f} MB"
-    )
-    print(f"for the raters:  {shown(folder / PAGE)}")
-    print(f"keep it secret:  {shown(folder / KEY)}")
-    if size > LARGEST_PAGE:
-        note(f"the page is {size / 1e6:.0f} MB. To make it smaller, reduce size, frames or pairs")
 
 
 # The answers.
@@ -216,59 +176,44 @@ def _evaluate(cfg: DictConfig) -> None:
     from cadam3d.study.summary import bullets, markdown
 
     require_range("least_caught", cfg.least_caught, low=0, high=1)
-    paths = find_files(_texts(cfg.answers))
-    files, left = read_files(paths)
-    if not files:
-        _warn_all(left)
-        raise _no_answers(f"{plural(len(paths), 'file')} without any")
+    files, left = read_files(find_files(_texts(cfg.answers)))
+    listed = _reported(left)
     place, key = _find_key(cfg, files)
-    collected = collect(files, key)
-    left += collected.left_out
-    _warn_all(left)
-    if not collected.raters:
-        raise _no_answers(f"none to the study of {shown(place)}, for the reasons above")
-    analysis = analyse(collected.raters, least_caught=float(cfg.least_caught))
+    raters, left = collect(files, key)
+    listed += _reported(left)
+    analysis = analyse(raters, least_caught=float(cfg.least_caught))
     page = markdown(analysis)
     print(page)
-    folder = place.parent
-    listed = [{"file": plain(each.path.name), "reason": plain(each.reason)} for each in left]
     facts = {"study": key.study, "catch_trials": key.catch_trials, "trials": len(key.trials)}
-    write_json(folder / RESULTS, {"kind": RESULTS_KIND, **facts, "left_out": listed, **analysis.to_json()})
+    write_json(place / RESULTS, {"kind": "study results", **facts, "left_out": listed, **analysis.to_json()})
     if listed:
         lines = bullets([f"{each['file']}: {each['reason']}" for each in listed])
         page += f"\nFiles that are left out:\n\n{lines}\n"
-    with replacing(folder / TABLE) as temporary:
+    with replacing(place / TABLE) as temporary:
         temporary.write_text(page, encoding="utf-8")
-    print(f"{shown(folder / RESULTS)}, {shown(folder / TABLE)}")
+    print(f"{shown(place / RESULTS)}, {shown(place / TABLE)}")
 
 
-def _warn_all(left: Sequence[LeftOut]) -> None:
-    for each in left:
-        say(plain(f"Warning: {shown(each.path)} is left out: {each.reason}"))
+def _reported(left: Mapping[Path, str]) -> list[dict[str, str]]:
+    """Print a warning for each file that is left out, and return the entries of ``study.json`` about them."""
+    for path, reason in left.items():
+        say(plain(f"Warning: {shown(path)} is left out: {reason}"))
+    return [{"file": plain(path.name), "reason": plain(reason)} for path, reason in left.items()]
 
 
-def _no_answers(got: str) -> UserError:
-    return UserError(f"answers: expected files that raters have saved, got {got}. Try: cadam3d study --help")
-
-
-def _find_key(cfg: DictConfig, files: Sequence[AnswerFile]) -> tuple[Path, Key]:
-    """Return the key of the study that most of the files are about, and its path."""
+def _find_key(cfg: DictConfig, files: Mapping[Path, AnswerFile]) -> tuple[Path, Key]:
+    """Return the folder of the key of the study that the files are about, and the key."""
     if cfg.key is not None:
         path = expanded(cfg.key)
-        return path, read_key(path / KEY if path.is_dir() else path)
-    around = [place for file in files for place in list(file.path.absolute().parents)[:2]]
-    paths = [folder / KEY for folder in dict.fromkeys([expanded(str(cfg.output)), *around])]
-    keys = {path: read_key(path) for path in paths if path.is_file()}
-    for study, _ in Counter(file.study for file in files).most_common():
-        for path, key in keys.items():
-            if key.study == study:
-                return path, key
-    others = ", ".join(str(shown(path)) for path in keys)
-    raise UserError(
-        f"key: expected the key of the study {files[0].study!r} in {cfg.output}/, beside the answers or in "
-        f"the folder above, got {f'keys of other studies in {others}' if keys else 'none'}. "
-        "Try: cadam3d study --help"
-    )
+        path = path / KEY if path.is_dir() else path
+        return path.parent, read_key(path)
+    around = [folder for path in files for folder in list(path.absolute().parents)[:2]]
+    studies = {file.study for file in files.values()}
+    for folder in dict.fromkeys([expanded(cfg.output), *around]):
+        if (folder / KEY).is_file() and (key := read_key(folder / KEY)).study in studies:
+            return folder, key
+    expected = f"the key of the study in {cfg.output}/, beside the answers or in the folder above"
+    raise fail("key", expected=expected, got=None, example="key=FILE")
 
 
 def _texts(value: Any) -> list[str]:

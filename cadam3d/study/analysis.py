@@ -12,9 +12,7 @@ from typing import Any
 
 import numpy as np
 from scipy.special import expit
-from scipy.stats import binom
 
-from cadam3d.core.checks import require_range
 from cadam3d.core.errors import UserError
 from cadam3d.study.answers import Answer, Rater
 from cadam3d.study.estimates import (
@@ -22,14 +20,13 @@ from cadam3d.study.estimates import (
     Clusters,
     Interval,
     SignTest,
-    agreement,
     count_wins,
     fit_strengths,
     holm,
+    is_ranked,
     rate_interval,
     sign_test,
     strength_margins,
-    unranked,
 )
 from cadam3d.study.questions import QUESTION_NAMES
 
@@ -43,7 +40,6 @@ class Screened:
     name: str
     right: int  # answers in catch trials
     total: int
-    by_chance: float  # probability that independent guesses pass
 
 
 @dataclass(frozen=True)
@@ -97,25 +93,15 @@ class Strength:
 
 
 @dataclass(frozen=True)
-class Ranking:
-    """The strengths of more than two arms, or why they cannot be estimated."""
-
-    strengths: tuple[Strength, ...]  # strongest first; empty if there is a problem
-    problem: str | None
-
-
-@dataclass(frozen=True)
 class QuestionResult:
     """The result of one question."""
 
     question: str  # one of QUESTION_NAMES
-    raters: int
-    prompts: int
-    answers: int
     rates: tuple[Rate, ...]  # one for each arm that was compared, by name
     comparisons: tuple[ComparedPair, ...]  # one for each pair of arms that was compared
-    ranking: Ranking | None  # None for two arms, because the rates say the same
-    agreement: float | None  # Krippendorff's alpha of the raters, for two arms
+    # The strongest arm is first. None for two arms, of which the rates say the same; empty if the answers do
+    # not determine the strengths.
+    strengths: tuple[Strength, ...] | None
 
 
 @dataclass(frozen=True)
@@ -141,14 +127,12 @@ def analyse(raters: Sequence[Rater], *, least_caught: float) -> Analysis:
     A rater is excluded if the share of right answers in catch trials is below ``least_caught``, in [0, 1]. A
     rater who has seen no catch trial is kept. Raises ``UserError`` if no answer is left.
     """
-    require_range("least_caught", least_caught, low=0, high=1)
     screening = screen(raters, least_caught)
     kept = {rater.name for rater in screening.kept}
     answers = [answer for rater in raters if rater.name in kept for answer in rater.answers]
     if not answers:
         raise UserError(
-            "answers: expected answers of at least one rater who passes the catch trials, got none "
-            f"(raters who failed: {len(screening.excluded)} of {len(raters)}). Try: least_caught=0"
+            "answers: expected answers of a rater who passes the catch trials, got none. Try: least_caught=0"
         )
     by_question = [[each for each in answers if each.question == name] for name in QUESTION_NAMES]
     results = [question_result(each) for each in by_question if each]
@@ -180,10 +164,8 @@ def screen(raters: Sequence[Rater], least: float) -> Screening:
     for rater in sorted(raters, key=lambda rater: rater.name):
         right, total = sum(rater.catches), len(rater.catches)
         needed = math.ceil(total * least - 1e-9)
-        # Half of the guesses are right on average.
-        by_chance = float(binom.sf(needed - 1, total, EVEN))
         passed = kept if right >= needed else excluded
-        passed.append(Screened(rater.name, right, total, by_chance))
+        passed.append(Screened(rater.name, right, total))
     return Screening(least, tuple(kept), tuple(excluded))
 
 
@@ -195,18 +177,13 @@ def question_result(answers: Sequence[Answer]) -> QuestionResult:
     answers = sorted(answers, key=lambda each: (each.rater, each.prompt, each.chosen, each.other))
     arms = _arms(answers)
     pairs = [pair for pair in combinations(arms, 2) if _between(answers, *pair)]
-    has_two_arms = len(arms) == 2
     return QuestionResult(
         question=answers[0].question,
-        raters=len({answer.rater for answer in answers}),
-        prompts=len({answer.prompt for answer in answers}),
-        answers=len(answers),
         rates=tuple(
             _rate(arm, [each for each in answers if arm in (each.chosen, each.other)]) for arm in arms
         ),
         comparisons=tuple(_comparison(*pair, _between(answers, *pair)) for pair in pairs),
-        ranking=None if has_two_arms else _ranking(arms, answers),
-        agreement=agreement(_is_chosen(arms[0], answers), _clusters(answers)) if has_two_arms else None,
+        strengths=_strengths(arms, answers) if len(arms) > 2 else None,
     )
 
 
@@ -248,23 +225,17 @@ def _comparison(first: str, second: str, answers: Sequence[Answer]) -> ComparedP
     )
 
 
-def _ranking(arms: Sequence[str], answers: Sequence[Answer]) -> Ranking:
+def _strengths(arms: Sequence[str], answers: Sequence[Answer]) -> tuple[Strength, ...]:
     position = {arm: i for i, arm in enumerate(arms)}
     chosen = np.array([position[answer.chosen] for answer in answers])
     other = np.array([position[answer.other] for answer in answers])
     wins = count_wins(chosen, other, len(arms))
-    apart = unranked(wins)
-    if apart is not None:
-        group, won_all = apart
-        inside = ", ".join(arms[i] for i in group)
-        outside = ", ".join(arm for i, arm in enumerate(arms) if i not in group)
-        won = f"{inside} won every comparison with {outside}, so their difference has no upper bound"
-        problem = won if won_all else f"no answer compares {inside} with {outside}"
-        return Ranking((), problem)
+    if not is_ranked(wins):
+        return ()
     values = fit_strengths(wins)
     margins = strength_margins(chosen, other, _clusters(answers), values)
     strengths = [
         Strength(arm, float(value), float(expit(value)), Interval.around(float(value), float(half)))
         for arm, value, half in zip(arms, values, margins, strict=True)
     ]
-    return Ranking(tuple(sorted(strengths, key=lambda each: (-each.log_odds, each.arm))), None)
+    return tuple(sorted(strengths, key=lambda each: (-each.log_odds, each.arm)))

@@ -5,29 +5,25 @@ The files come from strangers. A file that cannot be used is left out with a rea
 
 import glob
 import os
-from codecs import BOM_UTF8
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, TypeAdapter
+from pydantic import AfterValidator, Field, TypeAdapter
 
+from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.io.caption import plain
-from cadam3d.io.jsonl import parse_json
 from cadam3d.io.reading import read_bytes
 from cadam3d.io.run_folder import expanded, shown
-from cadam3d.study.key import KIND as KEY_KIND
-from cadam3d.study.key import Key
+from cadam3d.study.key import KEY, RESULTS, Key
 from cadam3d.study.questions import QUESTION_NAMES
 
-RESULTS_KIND = "study results"
 LARGEST_FILE = 1 << 22  # bytes; an answer has about a hundred
-LONGEST_NAME = 60  # characters, as on the page
-LONGEST_ID = 64  # characters
-MOST_FILES = 10_000
+# A text that can be printed, such as the name of a rater.
+Name = Annotated[str, Field(max_length=64), AfterValidator(plain), Field(min_length=1)]
 
 
 @dataclass(frozen=True)
@@ -65,30 +61,15 @@ class Pick:
 
 @dataclass(frozen=True)
 class AnswerFile:
-    """The choices that a rater has saved."""
+    """What a rater has saved."""
 
-    path: Path
-    study: str
-    rater: str
-    session: str  # drawn by the page when the rater began
+    kind: Literal["study answers"]
+    version: Literal[1]
+    study: Name
+    rater: Name
+    session: Name  # drawn by the page when the rater began
     saves: int  # how often the rater had saved, this time included
-    choices: tuple[Pick, ...]
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """A file that is not used, and why."""
-
-    path: Path
-    reason: str
-
-
-@dataclass(frozen=True)
-class Collected:
-    """The raters of a study, and the files that are left out."""
-
-    raters: list[Rater]
-    left_out: list[LeftOut]
+    answers: tuple[Pick, ...]
 
 
 def find_files(patterns: Sequence[str]) -> list[Path]:
@@ -107,46 +88,32 @@ def find_files(patterns: Sequence[str]) -> list[Path]:
         else:
             paths = sorted(map(Path, glob.glob(str(place))))  # noqa: PTH207  (Path.glob refuses absolute patterns)
         if not paths:
-            reason = "has no .json file" if place.is_dir() else "there is no such file"
-            raise UserError(
-                f"answers: expected files that raters have saved, got {pattern!r} ({reason}). "
-                "Try: cadam3d study --help"
-            )
+            raise fail("answers", expected="files that raters have saved", got=pattern)
         found |= dict.fromkeys(paths)
-    if len(found) > MOST_FILES:
-        raise UserError(
-            f"answers: expected at most {MOST_FILES} files, got {len(found)}. Try: cadam3d study --help"
-        )
     return list(found)
 
 
-def read_files(paths: Sequence[Path]) -> tuple[list[AnswerFile], list[LeftOut]]:
-    """Return the content of the files with answers, and the files that cannot be used.
+def read_files(paths: Sequence[Path]) -> tuple[dict[Path, AnswerFile], dict[Path, str]]:
+    """Return the content of the files with answers, and the reason for each file that cannot be used.
 
-    The key and the results of a study may be in the same folder. They are skipped without a message.
+    The key and the results of a study may be in the same folder. They are skipped.
     """
-    files: list[AnswerFile] = []
-    left: list[LeftOut] = []
+    reader = TypeAdapter(AnswerFile)
+    files: dict[Path, AnswerFile] = {}
+    left: dict[Path, str] = {}
     for path in paths:
+        if path.name in (KEY, RESULTS):
+            continue
         try:
-            # Some editors on Windows put a mark before the text.
-            content = read_bytes(path, largest=LARGEST_FILE).removeprefix(BOM_UTF8)
-            value = parse_json(content)
-            if isinstance(value, dict) and value.get("kind") in (KEY_KIND, RESULTS_KIND):
-                continue
-            files.append(_file(path, content))
-        except UserError as error:
-            # Its beginning is the path, and its end is a hint to use another file.
-            reason = str(error).removeprefix(f"{path}: ").partition(". Try: ")[0]
-            left.append(LeftOut(path, reason))
-        except (ValueError, RecursionError) as error:
+            files[path] = reader.validate_json(read_bytes(path, largest=LARGEST_FILE), strict=True)
+        except (UserError, ValueError) as error:
             reason = " ".join(str(error).split())[:100]
-            left.append(LeftOut(path, f"it is not a complete file of answers ({reason})"))
+            left[path] = f"it is not a complete file of answers ({reason})"
     return files, left
 
 
-def collect(files: Sequence[AnswerFile], key: Key) -> Collected:
-    """Return the raters of the study of ``key`` with their answers about arms.
+def collect(files: Mapping[Path, AnswerFile], key: Key) -> tuple[list[Rater], dict[Path, str]]:
+    """Return the raters of the study of ``key``, and the reason for each file that is left out.
 
     - A file of another study is left out, and so is a file with answers that do not fit the study.
     - A session is of one rater, even if its files have different names. The last file of it counts.
@@ -155,88 +122,51 @@ def collect(files: Sequence[AnswerFile], key: Key) -> Collected:
     - A rater may have answered only some of the questions. These answers count.
     """
     raters: list[Rater] = []
-    left: list[LeftOut] = []
-    sessions: dict[str, list[AnswerFile]] = defaultdict(list)
-    for file in files:
-        problem = _problem(file, key)
-        if problem:
-            left.append(LeftOut(file.path, problem))
+    left: dict[Path, str] = {}
+    sessions: dict[str, list[Path]] = defaultdict(list)
+    for path, file in files.items():
+        if _fits(file, key):
+            sessions[file.session].append(path)
         else:
-            sessions[file.session].append(file)
-    of_name: dict[str, list[AnswerFile]] = defaultdict(list)
-    for same in sessions.values():
-        last = max(same, key=lambda file: (file.saves, len(file.choices)))
-        of_name[last.rater.casefold()].append(last)
-        newer = shown(last.path)
-        left += [
-            LeftOut(file.path, f"{newer} has the answers of the same session")
-            for file in same
-            if file is not last
-        ]
-    for same in of_name.values():
-        if len(same) == 1:
-            raters.append(_rater(same[0], key))
+            left[path] = f"its answers are not about the study {key.study}"
+    of_name: dict[str, list[Path]] = defaultdict(list)
+    for paths in sessions.values():
+        last = max(paths, key=lambda path: (files[path].saves, len(files[path].answers)))
+        of_name[files[last].rater.casefold()].append(last)
+        reason = f"{shown(last)} has the answers of the same session"
+        left |= {path: reason for path in paths if path != last}
+    for paths in of_name.values():
+        if len(paths) == 1:
+            raters.append(_rater(files[paths[0]], key))
             continue
-        for file in same:
-            others = ", ".join(str(shown(other.path)) for other in same if other is not file)
-            reason = f"another person or session has the same name {file.rater!r}: {others}"
-            left.append(LeftOut(file.path, reason))
-    return Collected(sorted(raters, key=lambda rater: rater.name.casefold()), left)
+        listed = ", ".join(str(shown(path)) for path in paths)
+        left |= dict.fromkeys(paths, f"several sessions have the name of this rater: {listed}")
+    return sorted(raters, key=lambda rater: rater.name.casefold()), left
 
 
-@dataclass(frozen=True)
-class _Saved:
-    """The entries of a file that are read."""
-
-    kind: Literal["study answers"]
-    version: Literal[1]
-    study: Annotated[str, Field(min_length=1, max_length=LONGEST_ID)]
-    rater: Annotated[str, Field(min_length=1, max_length=LONGEST_NAME)]
-    session: Annotated[str, Field(min_length=1, max_length=LONGEST_ID)]
-    saves: Annotated[int, Field(ge=0)]
-    answers: tuple[Pick, ...]
-
-
-def _file(path: Path, content: bytes) -> AnswerFile:
-    """Return the answers in the bytes of a file. Raises ``ValueError`` for any other content."""
-    saved = TypeAdapter(_Saved).validate_json(content, strict=True)
-    if len({(pick.trial, pick.question) for pick in saved.answers}) < len(saved.answers):
-        raise ValueError("a question is answered twice")
-    # A name may have characters that cannot be seen, such as those inside some emoji and Persian words.
-    rater = plain(saved.rater)
-    if not all((rater, saved.study.isprintable(), saved.session.isprintable())):
-        raise ValueError("rater, study, session: expected texts that can be printed")
-    return AnswerFile(path, saved.study, rater, saved.session, saved.saves, saved.answers)
-
-
-def _problem(file: AnswerFile, key: Key) -> str:
-    """Return why the answers in a file are not about the study of ``key``; "" if they are."""
-    if file.study != key.study:
-        return f"it is of another study ({file.study!r})"
-    if not file.choices:
-        return "it has no answers"
-    for choice in file.choices:
-        is_known = choice.question in QUESTION_NAMES and choice.trial < len(key.trials)
-        if not is_known or choice.chosen not in key.trials[choice.trial].clips:
-            return "an answer does not fit the study"
-    return ""
+def _fits(file: AnswerFile, key: Key) -> bool:
+    """Return whether the answers in a file are about the study of ``key``, each about another question."""
+    questions = {(pick.trial, pick.question) for pick in file.answers}
+    return (
+        file.study == key.study
+        and 0 < len(questions) == len(file.answers)
+        and all(
+            pick.question in QUESTION_NAMES
+            and pick.trial < len(key.trials)
+            and pick.chosen in key.trials[pick.trial].clips
+            for pick in file.answers
+        )
+    )
 
 
 def _rater(file: AnswerFile, key: Key) -> Rater:
-    return Rater(file.rater, tuple(_answers(file, key)), tuple(_catches(file, key)))
-
-
-def _answers(file: AnswerFile, key: Key) -> Iterator[Answer]:
-    for choice in file.choices:
-        trial = key.trials[choice.trial]
-        if trial.right is None:
-            [other] = set(trial.clips) - {choice.chosen}
-            chosen, lost = key.clips[choice.chosen], key.clips[other]
-            yield Answer(file.rater, trial.prompt, choice.question, chosen, lost)
-
-
-def _catches(file: AnswerFile, key: Key) -> Iterator[bool]:
-    for choice in file.choices:
-        right = key.trials[choice.trial].right
-        if right is not None:
-            yield choice.chosen == right
+    answers, catches = [], []
+    for pick in file.answers:
+        trial = key.trials[pick.trial]
+        if trial.right is not None:
+            catches.append(pick.chosen == trial.right)
+            continue
+        [other] = set(trial.clips) - {pick.chosen}
+        chosen, lost = key.clips[pick.chosen].arm, key.clips[other].arm
+        answers.append(Answer(file.rater, trial.prompt, pick.question, chosen, lost))
+    return Rater(file.rater, tuple(answers), tuple(catches))

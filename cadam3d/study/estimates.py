@@ -6,7 +6,7 @@ estimate in log-odds, plus and minus a quantile of Student's t times a standard 
 answers by rater and by prompt. ``docs/notes/study_statistics.md`` has the measured coverage.
 """
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -46,9 +46,9 @@ class Clusters:
     prompts: Int[np.ndarray, "n"]
 
     @classmethod
-    def of(cls, raters: Sequence[Hashable], prompts: Sequence[Hashable]) -> "Clusters":
+    def of(cls, raters: Sequence[str], prompts: Sequence[str]) -> "Clusters":
         """Return the clusters of answers from the names of their raters and prompts."""
-        return cls(_positions(raters), _positions(prompts))
+        return cls(*(np.unique(names, return_inverse=True)[1] for names in (raters, prompts)))
 
     @cached_property
     def cells(self) -> Int[np.ndarray, "n"]:
@@ -58,12 +58,6 @@ class Clusters:
     def sizes(self) -> Int[np.ndarray, "3 n"]:
         """Return for each answer how many answers share its rater, its prompt and its cell."""
         return np.stack([np.bincount(each)[each] for each in (self.raters, self.prompts, self.cells)])
-
-
-def _positions(names: Sequence[Hashable]) -> Int[np.ndarray, "n"]:
-    """Return the position of each name among the different names."""
-    found = {name: i for i, name in enumerate(dict.fromkeys(names))}
-    return np.array([found[name] for name in names], dtype=np.int64)
 
 
 def margin(influences: Float[np.ndarray, "n"], clusters: Clusters) -> float:
@@ -160,35 +154,13 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return corrected
 
 
-def agreement(chosen: Bool[np.ndarray, "n"], clusters: Clusters) -> float | None:
-    """Return Krippendorff's alpha of the raters: 1 for full agreement, about 0 for agreement by chance.
-
-    It is the variant for nominal data with missing answers. The result is ``None`` if no two raters have
-    answered about the same prompt, if a rater has answered about a prompt more than once, or if all answers
-    are the same.
-    """
-    if clusters.cells.max() + 1 < len(chosen):
-        return None
-    total = np.bincount(clusters.prompts)
-    for_first = np.bincount(clusters.prompts, weights=chosen)
-    pairable = total > 1
-    total, for_first = total[pairable], for_first[pairable]
-    answers, first = total.sum(), for_first.sum()
-    if first in (0, answers):
-        return None
-    observed = (for_first * (total - for_first) / (total - 1)).sum() / answers
-    expected = first * (answers - first) / (answers * (answers - 1))
-    return float(1 - observed / expected)
-
-
 def fit_strengths(wins: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k"]:
     """Return the strengths of k arms in the model of Bradley and Terry (1952), by maximum likelihood.
 
     ``wins[i, j]`` is how often arm i was chosen over arm j. The strengths are in log-odds and have the mean
     0: arm i is chosen over arm j with probability ``expit(s[i] - s[j])``. They exist only if
-    :func:`unranked` finds nothing.
+    :func:`is_ranked` says so.
     """
-    assert not unranked(wins)
 
     def loss(strengths: Float[np.ndarray, "k"]) -> tuple[float, Float[np.ndarray, "k"]]:
         """Return the negative log-likelihood and its gradient."""
@@ -238,20 +210,10 @@ def count_wins(
     return np.bincount(chosen * arms + other, minlength=arms * arms).reshape(arms, arms).astype(float)
 
 
-def unranked(wins: Float[np.ndarray, "k k"]) -> tuple[list[int], bool] | None:
-    """Return arms whose strengths relative to the others are not finite; ``None`` if there are none.
+def is_ranked(wins: Float[np.ndarray, "k k"]) -> bool:
+    """Return whether finite strengths of the arms exist.
 
-    The second value says whether these arms won all their comparisons with the others; if it is false, they
-    were never compared with the others. Finite strengths exist exactly if the arms cannot be divided into
-    two groups of which one never wins against the other (Ford, 1957).
+    They exist exactly if the arms cannot be divided into two groups of which one never wins against the other
+    (Ford, 1957).
     """
-    links = wins > 0
-    for connection in ("weak", "strong"):
-        count, groups = connected_components(links, directed=True, connection=connection)
-        if count == 1:
-            continue
-        for group in range(count):
-            inside = groups == group
-            if not links[np.ix_(~inside, inside)].any():
-                return np.flatnonzero(inside).tolist(), connection == "strong"
-    return None
+    return connected_components(wins > 0, connection="strong", return_labels=False) == 1

@@ -13,7 +13,6 @@ PUBLISHED = {
     "Baseline": (50.5, 45.8, 51.9, 55.7, 50.4),
     "CAdam": (49.4, 54.1, 48.0, 44.3, 49.5),
 }
-CHANCE_LIMIT = 0.1  # guesses should pass the catch trials of a rater less often
 SPECIAL = re.compile(r"([\\|<*`\[])")  # in Markdown; names of arms and raters may contain them
 NONE = "-"
 READING = (
@@ -24,7 +23,7 @@ READING = (
 
 
 def markdown(analysis: Analysis) -> str:
-    """Return the result of a study: its size, excluded raters, rates, strengths, pairs and agreement."""
+    """Return the result of a study: its size, excluded raters, rates, strengths and pairs."""
     sizes = (analysis.raters, "raters"), (analysis.prompts, "prompts"), (analysis.answers, "answers")
     parts = [
         "# User study",
@@ -34,13 +33,12 @@ def markdown(analysis: Analysis) -> str:
         _rates(analysis),
     ]
     if len(analysis.arms) > 2:
-        title = "Probability of being chosen over an arm of average strength, in % (Bradley-Terry model):"
+        title = (
+            "Probability of being chosen over an arm of average strength, in % (Bradley-Terry model). "
+            "Questions whose answers do not determine it are left out:"
+        )
         parts += [title, _strengths(analysis)]
     parts += ["How often the first arm of each pair was chosen:", _pairs(analysis), READING]
-    alphas = [(each.question, each.agreement) for each in analysis.questions if each.agreement is not None]
-    if alphas:
-        found = ", ".join(f"{name} {alpha:.2f}" for name, alpha in alphas)
-        parts.append(f"Agreement of the raters (Krippendorff's alpha, 1 is full agreement): {found}.")
     return "\n\n".join(parts) + "\n"
 
 
@@ -50,22 +48,15 @@ def bullets(lines: Sequence[str]) -> str:
 
 
 def screening_lines(analysis: Analysis) -> list[str]:
-    """Return which raters were excluded, by which rule, and what the catch trials cannot show."""
+    """Return which raters were excluded and which met no catch trial."""
     kept, excluded = analysis.screening.kept, analysis.screening.excluded
-    if not any(each.total for each in (*kept, *excluded)):
-        return ["No rater was excluded, because none met a catch trial."]
     names = ", ".join(f"{each.name} ({each.right} of {each.total})" for each in excluded) or "none"
+    untested = ", ".join(each.name for each in kept if not each.total) or "none"
     least = f"{100 * analysis.screening.least:g} %"
-    lines = [f"Excluded, with fewer than {least} right answers in catch trials: {names}."]
-    if untested := [each.name for each in kept if not each.total]:
-        lines.append(f"Kept without an answer in a catch trial: {', '.join(untested)}.")
-    weak = [each.by_chance for each in kept if each.total and each.by_chance > CHANCE_LIMIT]
-    if weak:
-        lines.append(
-            f"{len(weak)} raters met so few catch trials that guesses pass with a probability of up to "
-            f"{100 * max(weak):.0f} %."
-        )
-    return lines
+    return [
+        f"Excluded, with fewer than {least} right answers in catch trials: {names}.",
+        f"Kept without an answer in a catch trial: {untested}.",
+    ]
 
 
 def _rates(analysis: Analysis) -> str:
@@ -82,12 +73,11 @@ def _rates(analysis: Analysis) -> str:
 
 
 def _strengths(analysis: Analysis) -> str:
-    rows = []
-    for result in analysis.questions:
-        if result.ranking is not None and result.ranking.problem is not None:
-            rows.append([result.question, NONE, NONE, result.ranking.problem])
-        for each in result.ranking.strengths if result.ranking is not None else ():
-            rows.append([result.question, each.arm, _percent(each.preferred), _range(each.interval)])
+    rows = [
+        [result.question, each.arm, _percent(each.preferred), _range(each.interval)]
+        for result in analysis.questions
+        for each in result.strengths or ()
+    ]
     return _table(["question", "arm", "%", "95 % interval"], rows)
 
 

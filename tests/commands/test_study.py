@@ -202,7 +202,7 @@ def test_the_key_is_found_beside_the_answers_above_them_in_output_or_where_the_l
     ):
         assert type_line("study", *words).code == 0, words
     message = type_line("study", "answers=elsewhere", "key=nowhere").message
-    assert message.startswith("key: expected the key of a study, got 'nowhere' (nowhere: cannot be read")
+    assert message.startswith("key: expected the key of a study, got 'nowhere'")
     message = type_line("study", "answers=elsewhere").message
     assert message.startswith(f"key: expected the key of the study {key['study']!r}")
 
@@ -242,8 +242,8 @@ def test_a_text_of_consent_is_shown_as_text(arms, type_line, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((), "runs, answers: expected one of them, got neither. Try: cadam3d study --help"),
-        (("runs=a", "answers=b"), "runs, answers: expected one of them, got both. Try: answers=null"),
+        ((), "runs, answers: expected one of them, got neither"),
+        (("runs=a", "answers=b"), "runs, answers: expected one of them, got both"),
         (
             ("runs=[a,b]", "frames=0"),
             "frames: expected a whole number >= 1 and <= 1000, got 0. Try: frames=72",
@@ -253,7 +253,7 @@ def test_a_text_of_consent_is_shown_as_text(arms, type_line, tmp_path):
         (("runs=[a,b]", "labels=x"), "labels: expected a list of texts or null, got 'x'. Try: labels=null"),
         (("runs=[a,b]", "arms=x"), "arms: expected a list of texts or null, got 'x'. Try: arms=null"),
         (("runs=[a,b]", "backdrop=red"), "backdrop: expected a list of numbers, got 'red'. Try: 'backdrop="),
-        (("runs=[a,a]",), "runs: expected the folder of a sweep, or a list of 2 to 12 different folders"),
+        (("runs=[a,a]",), "labels: expected 2 different names, one for each arm"),
     ],
 )
 def test_a_wrong_line_is_one_message(words, message, type_line):

@@ -8,15 +8,14 @@ from scipy.stats import binomtest, t
 
 from cadam3d.study.estimates import (
     Clusters,
-    agreement,
     count_wins,
     fit_strengths,
     holm,
+    is_ranked,
     margin,
     rate_interval,
     sign_test,
     strength_margins,
-    unranked,
 )
 
 
@@ -124,30 +123,12 @@ def test_the_correction_of_holm_has_the_values_of_its_definition():
     assert holm([]) == []
 
 
-def test_agreement_is_krippendorffs_alpha():
-    """By hand: 4 pairable prompts with the answers 11, 00, 10 and 111; the answer about the last is alone."""
-    raters = [0, 1, 0, 1, 0, 1, 0, 1, 2, 0]
-    prompts = [0, 0, 1, 1, 2, 2, 3, 3, 3, 4]
-    chosen = np.array([1, 1, 0, 0, 1, 0, 1, 1, 1, 0]) > 0
-    # Coincidences: two of 9 values disagree; the values are 6 times 1 and 3 times 0.
-    expected = 1 - (2 / 9) / (2 * 6 * 3 / (9 * 8))
-    assert agreement(chosen, Clusters.of(raters, prompts)) == pytest.approx(expected)
-
-
-def test_agreement_is_1_for_raters_who_agree_and_undefined_without_a_shared_prompt():
-    clusters = crossed(4, 6)
-    assert agreement(clusters.prompts < 2, clusters) == 1
-    assert agreement(np.ones(24, dtype=bool), clusters) is None
-    assert agreement(np.array([True, False]), Clusters.of([0, 1], [0, 1])) is None
-    assert agreement(np.array([True, False]), Clusters.of([0, 0], [0, 0])) is None
-
-
 @pytest.mark.parametrize("arms", [2, 3, 6])
 def test_strengths_are_those_of_choix(arms):
     generator = np.random.default_rng(arms)
     true = generator.normal(size=arms)
     pairs = []
-    while unranked(count_wins(*(np.array(pairs, dtype=int).reshape(-1, 2).T), arms)) is not None:
+    while not is_ranked(count_wins(*(np.array(pairs, dtype=int).reshape(-1, 2).T), arms)):
         i, j = generator.choice(arms, 2, replace=False)
         pairs.append((i, j) if generator.random() < expit(true[i] - true[j]) else (j, i))
     expected = choix.ilsr_pairwise(arms, [(int(i), int(j)) for i, j in pairs], alpha=0)
@@ -174,13 +155,13 @@ def test_of_two_arms_the_interval_of_the_strength_is_that_of_the_rate():
 
 
 @pytest.mark.parametrize(
-    ("wins", "found"),
+    ("wins", "are_finite"),
     [
-        ([[0, 1, 0], [0, 0, 1], [1, 0, 0]], None),
-        ([[0, 1, 1], [1, 0, 1], [0, 0, 0]], ([0, 1], True)),
-        ([[0, 0, 0], [1, 0, 1], [1, 1, 0]], ([1, 2], True)),
-        ([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]], ([0, 1], False)),
+        ([[0, 1, 0], [0, 0, 1], [1, 0, 0]], True),
+        ([[0, 1, 1], [1, 0, 1], [0, 0, 0]], False),
+        ([[0, 0, 0], [1, 0, 1], [1, 1, 0]], False),
+        ([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]], False),
     ],
 )
-def test_arms_without_finite_strengths_are_found(wins, found):
-    assert unranked(np.array(wins, dtype=float)) == found
+def test_arms_without_finite_strengths_are_found(wins, are_finite):
+    assert is_ranked(np.array(wins, dtype=float)) == are_finite

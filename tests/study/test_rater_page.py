@@ -129,10 +129,10 @@ def test_a_rater_needs_only_the_keyboard_and_the_saved_file_can_be_evaluated(vis
     assert sides == [0, 0, 1, 1, 0] + [0] * 5 + [1] * 5
     assert json.loads(page.input_value("#text")) == content
     files, left = read_files(find_files([str(path)]))
-    collected = collect(files, read_key(folder / "key.json"))
+    raters, others = collect(files, read_key(folder / "key.json"))
     assert not left
-    assert not collected.left_out
-    [rater] = collected.raters
+    assert not others
+    [rater] = raters
     assert (rater.name, len(rater.answers), len(rater.catches)) == (
         "Ann 7",
         2 * len(QUESTIONS),

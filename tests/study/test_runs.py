@@ -6,7 +6,7 @@ import pytest
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import write_json
-from cadam3d.study.runs import Found, find_runs, pair_runs, select
+from cadam3d.study.runs import StudyRun, find_runs, pair_runs, select
 from cadam3d.sweep.folder import Job, Plan, write_plan
 
 
@@ -32,30 +32,21 @@ def make_sweep(folder: Path, jobs) -> Path:
     return folder
 
 
-def paired(found: Found, *, same_seed=True):
-    pairs = pair_runs(found.runs, same_seed=same_seed)
+def paired(found: list[StudyRun], *, same_seed=True):
+    pairs = pair_runs(found, same_seed=same_seed)
     return [(pair.prompt, *pair.arms, *(run.folder.name for run in pair.runs)) for pair in pairs]
 
 
-def find(*places: Path, labels=None) -> Found:
+def find(*places: Path, labels=None) -> list[StudyRun]:
     return find_runs([str(place) for place in places], labels)
 
 
-def test_two_runs_are_two_arms_named_by_their_densifiers(tmp_path):
-    one = make_run(tmp_path / "x", densifier="cadam")
-    other = make_run(tmp_path / "y", densifier="baseline")
-    assert paired(find(one, other)) == [("a cube", "baseline", "cadam", "y", "x")]
-
-
-def test_runs_of_one_densifier_are_named_by_their_folders_and_labels_replace_both(tmp_path):
-    places = [make_run(tmp_path / name, densifier="cadam") for name in ("x", "y")]
-    assert {run.arm for run in find(*places).runs} == {"x", "y"}
-    assert {run.arm for run in find(*places, labels=["old", "new"]).runs} == {"old", "new"}
-
-
-def test_the_name_of_an_arm_is_printable_whatever_a_folder_says(tmp_path):
-    places = [make_run(tmp_path / name, densifier=f"\x1b[2J{name}\n") for name in ("x", "y")]
-    assert {run.arm for run in find(*places).runs} == {"[2Jx", "[2Jy"}
+def test_runs_are_named_by_their_folders_and_labels_replace_them(tmp_path):
+    places = [make_run(tmp_path / name) for name in ("x", "y")]
+    assert paired(find(*places)) == [("a cube", "x", "y", "x", "y")]
+    assert {run.arm for run in find(*places, labels=["old", "new"])} == {"old", "new"}
+    with pytest.raises(UserError, match="labels: expected 2 different names"):
+        find(*places, labels=["old", "old"])
 
 
 def test_folders_with_a_run_per_prompt_are_paired_by_prompt_and_seed(tmp_path):
@@ -78,7 +69,7 @@ def test_a_sweep_is_compared_arm_by_arm_under_equal_conditions(tmp_path):
         for guidance in ("sds", "ism")
     ]
     found = find(make_sweep(tmp_path / "sweep", jobs))
-    pairs = pair_runs(found.runs, same_seed=True)
+    pairs = pair_runs(found, same_seed=True)
     assert len(pairs) == 4
     for pair in pairs:
         assert pair.arms == ("baseline", "cadam")
@@ -87,20 +78,19 @@ def test_a_sweep_is_compared_arm_by_arm_under_equal_conditions(tmp_path):
     assert len({(pair.prompt, pair.runs[0].conditions) for pair in pairs}) == 4
 
 
-def test_runs_without_an_asset_are_counted_and_left_out(tmp_path):
+def test_runs_without_an_asset_are_left_out(tmp_path):
     sweep = make_sweep(tmp_path / "sweep", [(arm, "a cube", 0, {}) for arm in ("baseline", "cadam", "none")])
     (sweep / "job2/asset.ply").unlink()
     found = find(sweep)
-    assert found.without_asset == 1
-    assert {run.arm for run in found.runs} == {"baseline", "cadam"}
+    assert {run.arm for run in found} == {"baseline", "cadam"}
 
 
 def test_only_the_chosen_prompts_are_paired(tmp_path):
     jobs = [(arm, prompt, 0, {}) for arm in ("baseline", "cadam") for prompt in ("a cube", "a cone")]
     found = find(make_sweep(tmp_path / "sweep", jobs))
-    assert {run.prompt for run in select(found.runs, None, {"a cone", "a torus"})} == {"a cone"}
+    assert {run.prompt for run in select(found, None, {"a cone", "a torus"})} == {"a cone"}
     with pytest.raises(UserError, match="prompts: expected prompts of the runs"):
-        select(found.runs, None, {"a torus"})
+        select(found, None, {"a torus"})
 
 
 def test_other_seeds_are_paired_in_order_on_request_only(tmp_path):
@@ -120,17 +110,19 @@ def test_two_runs_of_one_prompt_and_seed_in_one_arm_are_refused_with_their_names
     for arm, names in (("A", ("x", "y")), ("B", ("z",))):
         for name in names:
             make_run(tmp_path / arm / name)
-    with pytest.raises(UserError, match=r"two of 'a cube' with seed 0: x and y"):
+    with pytest.raises(
+        UserError, match=r"runs: expected one run of each prompt and seed in an arm, got \[.*x.*y"
+    ):
         paired(find(tmp_path / "A", tmp_path / "B"))
 
 
 @pytest.mark.parametrize(
     ("places", "message"),
     [
-        (["A"], "expected the folder of a sweep, or a list of 2 to 12 different folders"),
-        (["A", "A"], "2 to 12 different folders, each of which is an arm, got A, A"),
-        (["A", "nowhere"], "no such folder"),
-        (["A", "empty"], "it has no finished run"),
+        (["A"], "runs: expected the folder of a sweep, or a list"),
+        (["A", "A"], "labels: expected 2 different names"),
+        (["A", "nowhere"], "runs: expected folders of finished runs"),
+        (["A", "empty"], "runs: expected folders of finished runs"),
     ],
 )
 def test_places_that_are_no_arms_are_refused(tmp_path, monkeypatch, places, message):
@@ -143,7 +135,9 @@ def test_places_that_are_no_arms_are_refused(tmp_path, monkeypatch, places, mess
 
 def test_an_unknown_arm_is_refused_with_those_there_are(tmp_path):
     found = find(make_sweep(tmp_path / "sweep", [(arm, "a cube", 0, {}) for arm in ("baseline", "cadam")]))
-    with pytest.raises(UserError, match=r"arms: expected some of baseline, cadam, got 'cadm'"):
-        select(found.runs, ["cadm", "baseline"], None)
-    with pytest.raises(UserError, match="at least two with assets"):
-        select(found.runs, ["cadam"], None)
+    with pytest.raises(
+        UserError, match=r"arms: expected at least two of those with assets \(baseline, cadam\)"
+    ):
+        select(found, ["cadm", "baseline"], None)
+    with pytest.raises(UserError, match="at least two of those with assets"):
+        select(found, ["cadam"], None)
