@@ -3,8 +3,8 @@
     python scripts/bench_live.py --counts 4000 50000
 
 Everything is measured in one process and in CPU time, so that other load on the machine matters little: a
-step, a look for requests and for an open page, and a snapshot for an open page. A run looks four times a
-second and writes one snapshot a second, or fewer if these would take more than their share.
+step, a look for requests and for an open page, and a snapshot for an open page. A run looks for requests four
+times a second and writes one snapshot a second, or fewer if these would take more than their share.
 """
 
 import statistics
@@ -16,7 +16,6 @@ import measuring
 import torch
 
 from cadam3d.build import build_trainer, component
-from cadam3d.callback import live as callback
 from cadam3d.callback.live import Live
 from cadam3d.commands import control
 from cadam3d.commands.beginning import run_context
@@ -25,7 +24,7 @@ from cadam3d.io.live import touch_watched
 from cadam3d.settings.compose import compose
 from cadam3d.state import StepReport
 
-LOOKS = 1 / callback.LOOK_SECONDS  # per second
+LOOKS = 1 / control.LOOK_SECONDS  # per second
 
 
 def milliseconds(work: Callable[[], object], times: int, repeats: int) -> float:
@@ -44,7 +43,7 @@ def measure(count: int, share: float, folder: Path, device: torch.device) -> dic
     embedding = trainer.prior.embed(cfg.prompt, "")
     state = trainer.start(cfg.prompt, component(cfg.initializer), 0, device)
     context = run_context(cfg.prompt, trainer, state, folder)
-    step = milliseconds(lambda: trainer._step(state, embedding), times=3, repeats=5)
+    step = milliseconds(lambda: trainer.step(state, embedding), times=3, repeats=5)
 
     report = StepReport(step=state.step, loss=1.0, log={}, num_gaussians=count)
     live = Live(seconds=0.1, share=share)
@@ -57,7 +56,7 @@ def measure(count: int, share: float, folder: Path, device: torch.device) -> dic
 
     between = milliseconds(after_step, times=2000, repeats=5)
     # From here on, every call looks.
-    callback.LOOK_SECONDS = control.LOOK_SECONDS = live._look_at = stop._look_at = 0.0
+    control.LOOK_SECONDS = stop._look_at = 0.0
     look = milliseconds(after_step, times=500, repeats=5)
     closed = between / step + LOOKS * look / 1000
 
@@ -69,7 +68,7 @@ def measure(count: int, share: float, folder: Path, device: torch.device) -> dic
 
     shown = milliseconds(snapshot, times=1, repeats=7)
     size = (folder / "live/snapshot.bin").stat().st_size
-    callback.LOOK_SECONDS = control.LOOK_SECONDS = 1 / LOOKS
+    control.LOOK_SECONDS = 1 / LOOKS
     every = max(1.0, shown / 1000 / share)
     return {
         "Gaussians": f"{count:,}",

@@ -22,8 +22,6 @@ from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainSt
 
 log = logging.getLogger(__name__)
 
-LOOK_SECONDS = 0.25  # between two looks at whether a page is open
-
 
 @dataclass(kw_only=True)
 class Live(Callback):
@@ -38,8 +36,7 @@ class Live(Callback):
     # Whether files can be written. Becomes False after the first failure.
     _works: bool = field(default=False, init=False, repr=False)
     _watch: Watch = field(default_factory=lambda: Watch(Path()), init=False, repr=False)
-    # Readings of the monotonic clock at which the next look and the next snapshot are due.
-    _look_at: float = field(default=0.0, init=False, repr=False)
+    # The reading of the monotonic clock at which the next snapshot is due.
     _due: float = field(default=0.0, init=False, repr=False)
     # The step of the last snapshot, and whether the run was paused then.
     _shown: tuple[int, bool] = field(default=(-1, False), init=False, repr=False)
@@ -54,8 +51,7 @@ class Live(Callback):
         """Create ``live/`` and write the first numbers, so that a page finds them."""
         self._history.start(state)
         self._watch, self._works = Watch(context.folder), True
-        self._look_at = self._due = 0.0
-        self._shown, self._loss = (-1, False), None
+        self._due, self._shown, self._loss = 0.0, (-1, False), None
         with self._writing():
             begin(context.folder)
             self._write_state(context, state)
@@ -82,10 +78,7 @@ class Live(Callback):
     def _show(self, context: RunContext, state: TrainState, *, is_paused: bool) -> None:
         now = time.monotonic()
         is_news = is_paused != self._shown[1]
-        if not self._works or (now < self._look_at and not is_news):
-            return
-        self._look_at = now + LOOK_SECONDS
-        if not self._watch.is_watched() or (now < self._due and not is_news):
+        if not self._works or (now < self._due and not is_news) or not self._watch.is_watched():
             return
         with self._writing():
             if state.step != self._shown[0]:

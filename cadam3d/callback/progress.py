@@ -1,4 +1,4 @@
-"""Progress: step, number of Gaussians, loss, speed, time of the end and peak GPU memory.
+"""Progress: step, number of Gaussians, loss, speed and peak GPU memory.
 
 In a terminal or a notebook this is a bar. Otherwise, as in a log file or the console of a sweep's job, it is
 a line every few seconds.
@@ -17,7 +17,6 @@ from cadam3d.core.checks import require_range
 from cadam3d.core.console import say
 from cadam3d.state import Outcome, RunContext, StepReport, TrainState
 
-DAY = 24 * 3600
 GIB = 2**30
 TITLE = 32  # characters of the prompt
 
@@ -26,20 +25,16 @@ TITLE = 32  # characters of the prompt
 class Progress(Callback):
     """A tqdm bar on standard error if that is a terminal or the output of a notebook, else messages.
 
-    ``done`` is the time of day at which the last step will end if steps keep the average duration that they
-    have had since this process started training, without the time in which the run was paused. ``VRAM``, on a
-    CUDA device only, is the largest amount of memory that tensors have used at once; torch's cache and the
-    driver use more. The environment variable ``TQDM_DISABLE`` turns off both the bar and the lines.
+    ``VRAM``, on a CUDA device only, is the largest amount of memory that tensors have used at once; torch's
+    cache and the driver use more. The environment variable ``TQDM_DISABLE`` turns off both the bar and the
+    lines.
     """
 
     refresh_seconds: float
     line_seconds: float
     _bar: tqdm | None = field(default=None, init=False, repr=False)
-    # Step and time, in seconds since the epoch, at which this process started training. A pause moves the
-    # time by its length.
+    # The step and the seconds of training at which this process started.
     _begun: tuple[int, float] = field(default=(0, 0.0), init=False, repr=False)
-    # Time of the last call, in seconds since the epoch.
-    _called: float = field(default=0.0, init=False, repr=False)
     # The next line is due at this reading of the monotonic clock, in seconds.
     _due: float = field(default=0.0, init=False, repr=False)
     # The line of the last step; empty once it has been printed.
@@ -51,7 +46,7 @@ class Progress(Callback):
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Open the bar at the current step, if standard error can show one."""
-        self._begun, self._due, self._pending = (state.step, time.time()), 0.0, ""
+        self._begun, self._due, self._pending = (state.step, state.seconds), 0.0, ""
         self._bar = None
         if shows_bars():
             self._bar = tqdm(
@@ -66,29 +61,22 @@ class Progress(Callback):
     def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
         """Advance the bar by one step, or print a line if one is due."""
         shown = {"N": str(report.num_gaussians), "loss": f"{report.loss:.3g}"}
-        first_step, first_time = self._begun
-        now = self._called = time.time()
-        pace = (now - first_time) / max(report.step - first_step, 1)  # seconds per step
-        if first_step < report.step < context.total_steps:
-            shown["done"] = clock(now, pace * (context.total_steps - report.step))
         if (peak := peak_memory(state.gaussians.device)) is not None:
             shown["VRAM"] = f"{peak / GIB:.1f}GiB"
         if self._bar is not None:
             self._bar.set_postfix(shown, refresh=False)
             self._bar.update(1)
             return
-        if pace > 0:
-            shown = {"speed": f"{1 / pace:.3g} steps/s", **shown}
+        steps, seconds = report.step - self._begun[0], state.seconds - self._begun[1]
+        if seconds > 0:
+            shown = {"speed": f"{steps / seconds:.3g} steps/s", **shown}
         facts = ", ".join(f"{name}={value}" for name, value in shown.items())
         self._pending = f"{context.prompt[:TITLE]}: step {report.step}/{context.total_steps}, {facts}"
         if time.monotonic() >= self._due or report.step == context.total_steps:
             self._print()
 
     def on_pause(self, context: RunContext, state: TrainState) -> None:
-        """Leave the time since the last call out of all averages."""
-        now = time.time()
-        self._begun = (self._begun[0], self._begun[1] + now - self._called)
-        self._called = now
+        """Leave the pause out of the averages of the bar."""
         if self._bar is not None:
             self._bar.unpause()
 
@@ -113,12 +101,6 @@ class Progress(Callback):
 def shows_bars() -> bool:
     """Return whether standard error is a terminal, or the output of a cell in a notebook."""
     return sys.stderr.isatty() or type(sys.stderr).__module__ == "ipykernel.iostream"
-
-
-def clock(now: float, seconds: float) -> str:
-    """Return the local time ``seconds`` after ``now`` (since the epoch), with the weekday if a day away."""
-    pattern = "%H:%M" if seconds < DAY else "%a %H:%M"
-    return time.strftime(pattern, time.localtime(now + seconds))
 
 
 def peak_memory(device: torch.device) -> int | None:

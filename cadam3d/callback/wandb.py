@@ -67,12 +67,11 @@ class Wandb(Tracking):
             # The server may have more steps than this disk knows of, or fewer.
             self._recorded = max(self._run.step - 1, 0)
         self._keep()
-        folder = shown(context.folder / WANDB)
         if mode == "online":
             say(f"Weights & Biases: sending settings, numbers and previews to {self._run.url}")
         elif mode != "disabled":
-            say(f"Weights & Biases: nothing is sent ({reason}). To send the run later, type:")
-            say(f"  wandb sync {shlex.quote(str(folder))}")
+            folder = shlex.quote(str(shown(context.folder / WANDB)))
+            say(f"Weights & Biases: nothing is sent ({reason}). To send the run later: wandb sync {folder}")
 
     def record(self, step: int, numbers: Mapping[str, float], preview: Path | None) -> None:
         """Record one step, unless it is recorded already."""

@@ -1,9 +1,6 @@
 """``cadam3d view``: show a run or a file in a browser, and control a run that trains."""
 
-import errno
-import getpass
 import os
-import shlex
 import signal
 import socket
 import sys
@@ -77,16 +74,10 @@ def _listening(subject: ShownFile, port: int) -> Server:
     try:
         return Server(subject, port)
     except OSError as error:
-        used = "which another program uses" if error.errno == errno.EADDRINUSE else error.strerror or error
-        raise UserError(f"port: expected a free port, got {port} ({used}). Try: port=0") from error
+        raise UserError(f"port: expected a free port, got {port} ({error.strerror}). Try: port=0") from error
 
 
 def _hint(port: int) -> str:
     """Return how to reach the page from another machine, and how to end the server."""
-    try:
-        user = getpass.getuser()
-    except (OSError, KeyError, ImportError):  # no name of this user is known
-        user = "USER"
-    place = shlex.quote(f"{user}@{socket.gethostname()}")
-    tunnel = f"ssh -L {port}:{HOST}:{port} {place}"
+    tunnel = f"ssh -L {port}:{HOST}:{port} {socket.gethostname()}"
     return f"Ctrl-C ends the server. To open the address on another machine, first type there: {tunnel}"

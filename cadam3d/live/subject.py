@@ -19,7 +19,7 @@ from cadam3d.io.declarations import read_declarations
 from cadam3d.io.jsonl import is_whole
 from cadam3d.io.lock import holder_name, is_held
 from cadam3d.io.reading import open_contained, open_regular, signature
-from cadam3d.io.records import psnr_of, read_config, read_summary
+from cadam3d.io.records import psnr_of, read_config, read_metrics, read_summary
 from cadam3d.io.run_folder import (
     ASSET,
     CHARTS,
@@ -37,13 +37,12 @@ from cadam3d.io.run_folder import (
     setting_word,
     shown,
 )
-from cadam3d.live.curves import Curves
+from cadam3d.live.curves import curves_of, drawn
 from cadam3d.viewer.pack import pack
 
 LARGEST_SNAPSHOT = 1 << 30  # bytes; ten million Gaussians of SH degree 3 have less
 MOST_SAVED = 100  # files that a page lists
-LONGEST_TITLE = 500  # characters
-CURVES = ("step", "num_gaussians", "seconds", "loss")  # entries of both the log and the live state
+CURVES = ("num_gaussians", "seconds", "loss")  # entries of both the log and the live state
 # Files of a run that the page, or the report, offers under their own names.
 OFFERED = (ASSET, CONFIG, METRICS, PREVIEW, SUMMARY, TURNTABLE)
 
@@ -128,7 +127,7 @@ class ShownRun(ShownFile):
 
     def __post_init__(self) -> None:
         self._packed = Kept(partial(self._open, ASSET), lambda: pack(self.read()))
-        self._curves = Curves(self.place)
+        self._curves = Kept(partial(self._open, METRICS), lambda: curves_of(read_metrics(self.place)))
         self._summary = Kept(partial(self._open, SUMMARY), lambda: read_summary(self.place))
         self._config = Kept(partial(self._open, CONFIG), lambda: read_config(self.place / CONFIG))
         self._declared = Kept(partial(self._open, CHARTS), lambda: read_declarations(self.place))
@@ -141,28 +140,28 @@ class ShownRun(ShownFile):
     def state(self) -> dict[str, Any]:
         """Return what the page shows beside the picture, and tell the run that a page is open."""
         is_writable = live.touch_watched(self.place)
-        self._curves.update()
-        config, now = self._config.get() or {}, self._live()
+        config, now, curves = self._config.get() or {}, self._live(), self._curves.get() or {}
         title, total = config.get("prompt"), config.get("steps")
+        log = {key: curves[key][-1][1] if curves.get(key) else None for key in CURVES}
+        log["step"] = max((points[-1][0] for points in curves.values() if points), default=0)
         facts = {
             "kind": "run",
-            "title": title[:LONGEST_TITLE] if isinstance(title, str) else self.place.name,
+            "title": title if isinstance(title, str) else self.place.name,
             "resume": f"cadam3d train {setting_word('resume', shown(self.place))}",
             "picture": _name(self._version(LIVE_SNAPSHOT if self._shows_snapshot(now) else ASSET)),
-            "charts": f"{self._curves.version} {_name(self._declared.version())}",
+            "charts": f"{_name(self._curves.version())} {_name(self._declared.version())}",
             "saved": self._saved(),
             "has_asset": self._version(ASSET) is not None,
             "has_report": self._version(REPORT) is not None,
             "total_steps": total if is_whole(total) else None,
-            "step": self._curves.last_step,
-            **{key: self._curves.last(key) for key in CURVES if key != "step"},
         }
         if now is not None:
             status = "ending" if now["has_ended"] else "paused" if now["is_paused"] else "training"
             asked = [request for request in live.REQUESTS if live.is_asked(self.place, request)]
             # The log may be ahead, because the process writes its numbers for open pages only.
-            log = {key: facts[key] for key in CURVES} if self._curves.last_step > now["step"] else {}
-            return facts | now | log | {"status": status, "asked": asked, "is_writable": is_writable}
+            newest = now | log if log["step"] > now["step"] else log | now
+            return facts | newest | {"status": status, "asked": asked, "is_writable": is_writable}
+        facts |= log
         if is_held(self.place / LOCK):
             return facts | {"status": "busy"}
         summary = self._summary.get() or {}
@@ -183,8 +182,7 @@ class ShownRun(ShownFile):
 
     def charts(self) -> list[dict[str, Any]]:
         """Return the curves of the run, as it has declared them."""
-        self._curves.update()
-        return self._curves.drawn(self._declared.get() or ())
+        return drawn(self._curves.get() or {}, self._declared.get() or ())
 
     def ask(self, request: str, process: str) -> bool:
         """Pass a request on, unless another process has taken the place of ``process``."""

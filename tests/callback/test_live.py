@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from cadam3d.callback import live as module
 from cadam3d.callback.base import Callback
 from cadam3d.callback.live import Live
 from cadam3d.io import live
@@ -50,9 +49,8 @@ class Page(Callback):
 
 
 @pytest.fixture
-def watch(train, monkeypatch):
+def watch(train):
     """Return a function that trains a few steps, with an open page or without, and returns state and page."""
-    monkeypatch.setattr(module, "LOOK_SECONDS", 0.0)
 
     def run(folder: Path, *line: str, with_live=True, is_open=True, share=1.0):
         callback = Live(seconds=0.1, share=share)

@@ -1,4 +1,4 @@
-"""Progress: a bar in a terminal and lines elsewhere, with step, time of the end and peak GPU memory."""
+"""Progress: a bar in a terminal and lines elsewhere, with step, speed and peak GPU memory."""
 
 import re
 import time
@@ -8,7 +8,7 @@ import torch
 from _pytest.capture import CaptureIO
 
 from cadam3d.callback import progress
-from cadam3d.callback.progress import Progress, clock, peak_memory
+from cadam3d.callback.progress import Progress, peak_memory
 from cadam3d.state import Outcome, StepReport
 
 CPU = torch.device("cpu")
@@ -65,7 +65,7 @@ def last_line(capsys) -> str:
     return re.split(r"[\r\n]", capsys.readouterr().err.rstrip())[-1]
 
 
-def test_the_bar_shows_the_step_and_the_time_of_the_end(bar, at_noon, run, capsys):
+def test_the_bar_shows_the_step_and_the_loss(bar, at_noon, run, capsys):
     bar.on_start(*run)
     for number in range(1, 5):
         at_noon.now += 600  # ten minutes per step, so six more steps take an hour
@@ -74,45 +74,29 @@ def test_the_bar_shows_the_step_and_the_time_of_the_end(bar, at_noon, run, capsy
     assert "4/10" in line
     assert "N=5" in line
     assert "loss=0.5" in line
-    assert "done=13:40" in line
     assert "VRAM" not in line  # only on CUDA devices
     assert "step 4" not in line  # a bar, not a line
 
 
-def test_the_pace_of_a_resumed_run_counts_only_its_own_steps(bar, at_noon, run, capsys):
-    run[1].step = 6
+def test_the_bar_leaves_a_pause_out(bar, at_noon, run, capsys):
     bar.on_start(*run)
     at_noon.now += 60
-    step(bar, run, 7)
-    line = last_line(capsys)
-    assert "7/10" in line
-    assert "done=12:04" in line
-
-
-def pause_for_an_hour(shown: Progress, at_noon, run, capsys) -> str:
-    """Take a minute for each of two steps, with an hour between them, and return the last line."""
-    shown.on_start(*run)
-    at_noon.now += 60
-    step(shown, run, 1)
+    step(bar, run, 1)
     for _ in range(4):
         at_noon.now += 900
-        shown.on_pause(*run)
+        bar.on_pause(*run)
     at_noon.now += 60
-    step(shown, run, 2)
-    shown.on_end(*run, Outcome.INTERRUPTED)
-    return last_line(capsys)
+    step(bar, run, 2)
+    bar.on_end(*run, Outcome.INTERRUPTED)
+    assert "[02:00<" in last_line(capsys)
 
 
-def test_the_bar_leaves_a_pause_out(bar, at_noon, run, capsys):
-    line = pause_for_an_hour(bar, at_noon, run, capsys)
-    assert "[02:00<" in line
-    assert "done=13:10" in line
-
-
-def test_the_lines_leave_a_pause_out(lines, at_noon, run, capsys):
-    line = pause_for_an_hour(lines, at_noon, run, capsys)
-    assert "speed=0.0167 steps/s" in line
-    assert "done=13:10" in line
+def test_the_speed_of_a_resumed_run_counts_only_its_own_steps(lines, run, capsys):
+    run[1].step, run[1].seconds = 6, 500.0
+    lines.on_start(*run)
+    run[1].seconds += 4
+    step(lines, run, 7)
+    assert "speed=0.25 steps/s" in last_line(capsys)
 
 
 def test_elsewhere_there_is_a_whole_line_for_the_first_and_last_step_and_every_few_seconds(
@@ -121,6 +105,7 @@ def test_elsewhere_there_is_a_whole_line_for_the_first_and_last_step_and_every_f
     lines.on_start(*run)
     for number in range(1, 11):
         at_noon.now += 4
+        run[1].seconds += 4
         step(lines, run, number)
     lines.on_end(*run, Outcome.FINISHED)
     printed = capsys.readouterr().err
@@ -128,7 +113,7 @@ def test_elsewhere_there_is_a_whole_line_for_the_first_and_last_step_and_every_f
     assert printed.endswith("\n")
     shown = printed.splitlines()
     assert re.findall(r"step (\d+)/10", printed) == ["1", "4", "7", "10"]
-    assert shown[1] == "a red cube: step 4/10, speed=0.25 steps/s, N=5, loss=0.5, done=12:00"
+    assert shown[1] == "a red cube: step 4/10, speed=0.25 steps/s, N=5, loss=0.5"
     assert shown[3] == "a red cube: step 10/10, speed=0.25 steps/s, N=5, loss=0.5"
 
 
@@ -186,11 +171,3 @@ def test_the_peak_includes_memory_that_was_freed_since():
     block = torch.empty(2**26, dtype=torch.uint8, device=device)
     del block
     assert peak_memory(device) >= 2**26
-
-
-@pytest.mark.parametrize(
-    ("seconds", "shown"),
-    [(0, "12:00"), (3600 * 11.5, "23:30"), (3600 * 13, "01:00"), (3600 * 37, "Fri 01:00")],
-)
-def test_the_clock_shows_the_weekday_if_the_time_is_a_day_or_more_away(seconds, shown):
-    assert clock(NOON, seconds) == shown

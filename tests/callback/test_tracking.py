@@ -334,7 +334,7 @@ def test_wandb_leaves_no_link_to_files_outside_of_the_run(offline):
 @pytest.mark.slow
 def test_the_run_says_that_nothing_is_sent_and_how_to_send_it_later(offline):
     assert offline[1][0].startswith("Weights & Biases: nothing is sent (there is no API key")
-    assert offline[1][1].split("wandb sync ")[1] == f"'{offline[0] / 'wandb'}'"
+    assert offline[1][0].split("wandb sync ")[1] == f"'{offline[0] / 'wandb'}'"
 
 
 @pytest.mark.slow

@@ -148,7 +148,7 @@ def test_a_single_file_is_served_and_a_port_that_is_in_use_is_named(tmp_path, ty
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         message = type_line("view", "ply=thing.ply", "open=false", f"port={port}").message
-    assert message == f"port: expected a free port, got {port} (which another program uses). Try: port=0"
+    assert message.startswith(f"port: expected a free port, got {port} (")
 
 
 @pytest.mark.parametrize("port", ["-1", "65536", "1.5", "true", "null", "abc"])
