@@ -12,7 +12,6 @@ docs/notes/performance.md describes the measurement.
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -25,9 +24,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import measuring
 from rasterizer_bench.check import check, check_long_sort
-from rasterizer_bench.scenes import Scene, make_scene, make_shell
-from rasterizer_bench.stages import NoKernelsError, copy_speed, time_stages
-from rasterizer_bench.timing import OUT_OF_MEMORY, Timing, take_turns
+from rasterizer_bench.scenes import make_scene, make_shell
+from rasterizer_bench.stages import copy_speed, time_stages
+from rasterizer_bench.timing import OUT_OF_MEMORY, take_turns
 
 from cadam3d.build import component
 from cadam3d.core.errors import UserError
@@ -128,10 +127,10 @@ def check_all(
 def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher: Launcher | None) -> None:
     """Time the backends on every scene, print the results, and write them to the JSON file."""
     device = torch.device(args.device)
-    has_stages = launcher is not None and args.stages
     report: dict[str, Any] = {"machine": measuring.machine(device), "rows": [], "stages": []}
     report["settings"] = {name: value for name, value in vars(args).items() if name != "json"}
-    report["copy_bytes_per_ms"] = copy_speed(device, COPY_BYTES[device.type]) if has_stages else None
+    speed = copy_speed(device, COPY_BYTES[device.type]) if launcher is not None and args.stages else None
+    report["copy_bytes_per_ms"] = speed
     print(f"{report['machine']['name']}, {args.threads} thread(s), {args.repeats} repetitions; milliseconds")
     for degree, count in product(args.degrees, args.counts):
         gaussians = make_shell(count, degree, device)
@@ -139,52 +138,35 @@ def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher
             at = {"count": count, "size": size, "views": views, "degree": degree}
             scene = make_scene(gaussians, size, views)
             timings = take_turns(backends, scene, args.repeats)
-            rows = make_rows(at, timings)
-            report["rows"] += rows
-            print(f"\n{measuring.table(list(map(shown, rows)))}", flush=True)
-            if has_stages and timings["cuda"]:
-                report["stages"] += add_stages(at, launcher, scene, args.repeats, report["copy_bytes_per_ms"])
+            report["rows"] += make_rows(at, timings)
+            print_table(make_rows(at, timings))
+            if launcher is not None and speed is not None and timings["cuda"]:
+                timing = time_stages(launcher, scene, args.repeats, speed)
+                print_table(timing.stages)
+                report["stages"].append(at | vars(timing))
             # The file is written after every scene, because a later one may exceed the memory.
             measuring.write(args.json, report)
 
 
-def make_rows(at: dict[str, int], timings: dict[str, Timing | None]) -> list[dict[str, Any]]:
+def make_rows(at: dict[str, int], timings: dict[str, dict[str, Any] | None]) -> list[dict[str, Any]]:
     """Return the times of each backend on one scene, in milliseconds; ``None`` if it ran out of memory."""
     first = next(iter(timings.values()))
     rows = []
     for name, timing in timings.items():
-        row: dict[str, Any] = {**at, "backend": name, "step_ms": None}
-        if timing is not None:
-            row |= {f"{phase}_ms": value for phase, value in timing.median_ms.items()}
-            row["ratio"] = None if first is None else first.median_ms["step"] / timing.median_ms["step"]
-            row["peak_bytes"] = timing.peak_bytes
+        row: dict[str, Any] = {**at, "backend": name, "step_ms": None, **(timing or {})}
+        if timing is not None and first is not None:
+            row["ratio"] = first["step_ms"] / timing["step_ms"]
         rows.append(row)
     return rows
 
 
-def shown(row: dict[str, Any]) -> dict[str, object]:
-    """Return a row with its numbers as text."""
-    if row["step_ms"] is None:
-        return {**row, "step_ms": "out of memory"}
-    return {key: f"{value:.2f}" if isinstance(value, float) else value for key, value in row.items()}
-
-
-def add_stages(
-    at: dict[str, int], launcher: Launcher, scene: Scene, repeats: int, speed: float
-) -> list[dict[str, Any]]:
-    """Time and print the stages of a scene, and return them for the report."""
-    try:
-        timing = time_stages(launcher, scene, repeats, speed)
-    except NoKernelsError as error:
-        print(f"no stages: {error}", flush=True)
-        return []
-    stages = [asdict(stage) for stage in timing.stages]
-    rows = [
-        {key: f"{value:.3f}" if isinstance(value, float) else value for key, value in stage.items()}
-        for stage in stages
+def print_table(rows: list[dict[str, Any]]) -> None:
+    """Print rows with their numbers as text."""
+    shown = [
+        {key: f"{value:.3f}" if isinstance(value, float) else value for key, value in row.items()}
+        for row in rows
     ]
-    print(f"\n{measuring.table(rows)}", flush=True)
-    return [{**at, "wall_ms": timing.wall_ms, "kernel_ms": timing.kernel_ms, "stages": stages}]
+    print(f"\n{measuring.table(shown)}", flush=True)
 
 
 def run(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher: Launcher | None) -> int:

@@ -6,9 +6,8 @@
     cadam3d train prior=shapes_sd prior.path=models/mine prompt="a red mushroom"
 
 It renders views with captions, trains an autoencoder, then a denoiser with its text encoders, and writes a
-folder in the layout of diffusers with a model card (README.md), sample pictures and a picture of the curves.
-After an interruption, the same line continues from the files in OUT/training. It needs
-pip install '.[diffusers]'.
+folder in the layout of diffusers with a model card (README.md) and sample pictures. After an interruption,
+the same line continues from the files in OUT/training. It needs pip install '.[diffusers]'.
 """
 
 import sys
@@ -16,6 +15,7 @@ from collections.abc import Sequence
 
 from prior_training import loop, options, stages
 from prior_training.card import write_card
+from prior_training.formats import FORMATS
 
 # Of --minutes: the shares of the autoencoder and of the denoiser. The rest is for views and latents.
 AUTOENCODER, DENOISER = 0.27, 0.6
@@ -27,7 +27,7 @@ def main(line: Sequence[str] | None = None) -> None:
         out=arguments.out,
         views=arguments.views,
         groups=arguments.groups,
-        kind=stages.format_of(arguments.format, arguments.size, arguments.prediction or "v_prediction"),
+        kind=FORMATS[arguments.format](size=arguments.size),
         seed=arguments.seed,
         processes=arguments.processes if arguments.device == "cpu" else 1,
         device=arguments.device,

@@ -21,10 +21,9 @@ from rasterizer_bench.scenes import make_scene as bench_scene
 from rasterizer_bench.stages import KernelRasterizer, stages_of
 from torch import Tensor
 
-from cadam3d.compiled.library import find_compiler
 from cadam3d.core.gaussians import FIELDS
 from cadam3d.rasterizer.driver import Launch, Launcher
-from cadam3d.rasterizer.selftest import IMAGES, Agreement, self_test
+from cadam3d.rasterizer.selftest import IMAGES
 from cadam3d.rasterizer.selftest import make_scene as self_test_scene
 from cadam3d.rasterizer.workspace import Workspace
 
@@ -202,11 +201,9 @@ def scenes() -> Iterator[tuple[Scene, float]]:
 def find_stage(launcher: Launcher, device: torch.device, truth: Launcher | None = None) -> dict[str, Any]:
     """Return the first stage that is wrong on the device, compared with the emulator.
 
-    Without a C++ compiler there is no emulator, and the stages are narrowed down by the self-test alone.
+    The emulator needs a C++ compiler.
     """
     truth = truth or load_truth()
-    if truth is None:
-        return narrow(self_test(KernelRasterizer(launcher), device))
     for scene, share in scenes():
         for absgrad in (False, True):
             want = record(truth, torch.device("cpu"), scene, absgrad)
@@ -216,29 +213,11 @@ def find_stage(launcher: Launcher, device: torch.device, truth: Launcher | None 
     return {"says": "every stage agrees with the emulator, up to rounding", "stage": None}
 
 
-def load_truth() -> Launcher | None:
-    """Return the emulator of the tests; ``None`` without a C++ compiler."""
-    if find_compiler() is None or not (TESTS / "emulation.py").is_file():
-        return None
+def load_truth() -> Launcher:
+    """Return the emulator of the tests."""
     sys.path.insert(0, str(TESTS))
     from emulation import load_emulator
 
     folder = Path(gettempdir()) / "cadam3d-emulator"
     folder.mkdir(mode=0o700, exist_ok=True)
     return load_emulator(folder)
-
-
-def narrow(agreement: Agreement) -> dict[str, Any]:
-    """Return which stages may be wrong, given the deviations of the self-test."""
-    wrong = [name for name, error in agreement.images.items() if not error <= agreement.demands.images]
-    worse = [name for name, error in agreement.gradients.items() if not error <= agreement.demands.gradients]
-    if {"means2d", "radii"} & set(wrong):
-        stages = "project"
-    elif wrong:
-        stages = "depth sort, tile lists, tile sort or blend forward"
-    elif worse:
-        stages = "blend backward or project backward"
-    else:
-        stages = "none, for this scene"
-    names = ", ".join([*wrong, *(f"gradient of {name}" for name in worse)]) or "nothing"
-    return {"says": f"without a C++ compiler: {names} is wrong, so the stage is {stages}", "stage": stages}

@@ -5,11 +5,11 @@ A result is a JSON file. Its line ``says`` is what the report quotes.
 
 import argparse
 import csv
-import io
 import json
 import subprocess
 import sys
 import time
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -34,50 +34,17 @@ METRICS = (
 
 
 def facts() -> dict[str, Any]:
-    """Return what torch says about the GPU, or a line about what keeps torch from using it."""
+    """Return what torch says about the GPU; it fails if torch cannot use the GPU."""
     import torch
 
-    found: dict[str, Any] = {"torch": torch.__version__, "torch_cuda": torch.version.cuda}
-    if torch.version.cuda is None:
-        return found | {"trouble": f"torch {torch.__version__} is built without CUDA. {_other_torch()}"}
-    try:
-        # The first operation finds out whether torch has kernels for this GPU.
-        assert (torch.ones(2, device="cuda") + 1).sum().item() == 4
-    except (RuntimeError, AssertionError) as error:
-        reason = (str(error).strip().splitlines() or ["an addition is wrong"])[0]
-        return found | {
-            "trouble": f"torch {torch.__version__} (CUDA {torch.version.cuda}) cannot use this GPU: "
-            f"{reason.rstrip('.')}. {_other_torch()}"
-        }
-    properties = torch.cuda.get_device_properties(0)
-    return found | {
-        "device": properties.name,
-        "capability": f"{properties.major}.{properties.minor}",
-        "memory_bytes": properties.total_memory,
-        "multiprocessors": properties.multi_processor_count,
-        "nvrtc": nvrtc(),
-    }
-
-
-def _other_torch() -> str:
-    """Return what to type for a torch that runs with the driver of this machine."""
-    from gpu_run.machine import NoGpuError, TroubleError, find_device, fitting_torch
-
-    try:
-        torch = fitting_torch(find_device().driver_cuda)
-    except NoGpuError:
-        torch = "torch"
-    except TroubleError as error:
-        return str(error)
-    return f"Try: {sys.executable} -m pip install --force-reinstall '{torch}'"
-
-
-def nvrtc() -> str | None:
-    """Return the version and the path of the compiler of the kernels."""
     from cadam3d.rasterizer.nvrtc import find_compiler
 
+    # The first operation finds out whether torch has kernels for this GPU.
+    assert (torch.ones(2, device="cuda") + 1).sum().item() == 4
     found = find_compiler()
-    return f"{'.'.join(map(str, found.version))} in {found.path}" if found else None
+    nvrtc = f"{'.'.join(map(str, found.version))} in {found.path}" if found else None
+    memory = torch.cuda.get_device_properties(0).total_memory
+    return {"torch": torch.__version__, "cuda": torch.version.cuda, "memory_bytes": memory, "nvrtc": nvrtc}
 
 
 def self_test_cuda() -> dict[str, Any]:
@@ -143,30 +110,19 @@ def kernels() -> dict[str, Any]:
 
 
 def explain(launcher: Any, device: Any, scenes: Any, repeats: int, copied: int) -> dict[str, Any]:
-    """Return the stages of scenes, as many as fit into memory."""
-    from dataclasses import asdict
-
+    """Return the stages of the scenes."""
     from rasterizer_bench.scenes import make_scene, make_shell
-    from rasterizer_bench.stages import NoKernelsError, copy_speed, time_stages
-    from rasterizer_bench.timing import OUT_OF_MEMORY
+    from rasterizer_bench.stages import copy_speed, time_stages
 
-    found, lacking, speed = [], [], copy_speed(device, copied)
+    rows, busy, speed = [], [], copy_speed(device, copied)
     for count, size, views, degree in scenes:
-        try:
-            times = time_stages(
-                launcher, make_scene(make_shell(count, degree, device), size, views), repeats, speed
-            )
-        except OUT_OF_MEMORY:
-            lacking.append(f"{count} Gaussians at {size} px do not fit into the memory")
-            continue
-        except NoKernelsError as error:
-            return {"says": str(error), "skipped": True}
+        scene = make_scene(make_shell(count, degree, device), size, views)
+        times = time_stages(launcher, scene, repeats, speed)
         at = {"count": count, "size": size, "views": views, "degree": degree}
-        found.append(at | {"wall_ms": times.wall_ms, "kernel_ms": times.kernel_ms})
-        found[-1]["stages"] = [asdict(stage) for stage in times.stages]
-    busy = [f"{each['kernel_ms']:.2f} of {each['wall_ms']:.2f} ms" for each in found]
+        rows += [at | stage for stage in times.stages]
+        busy.append(f"{times.kernel_ms:.2f} of {times.wall_ms:.2f} ms")
     says = f"kernels take {', '.join(busy)}; a copy moves {speed / 1e9:.2f} TB/s"
-    return {"says": "; ".join([says, *lacking]), "scenes": found, "copy_bytes_per_ms": speed}
+    return {"says": says, "stages": rows}
 
 
 def sorts() -> dict[str, Any]:
@@ -180,34 +136,23 @@ def sorts() -> dict[str, Any]:
 
 def compare_sorts(launcher: Any, device: Any, sizes: Any, repeats: int) -> dict[str, Any]:
     """Return the times of both sorts, which take turns."""
-    import statistics
+    from functools import partial
 
-    from measuring import now
+    from measuring import in_turns, median, milliseconds
     from rasterizer_bench.check import make_keys, sort_keys
-    from rasterizer_bench.timing import OUT_OF_MEMORY
 
-    def took(work: Callable[[], object]) -> float:
-        begin = now(device)
-        work()
-        return (now(device) - begin) * 1e3
-
-    found, lacking = [], []
+    found = []
     for count, bits in sizes:
-        try:
-            keys, times = make_keys(count, min(bits, 31), device), []
-            with launcher.on(device) as launch:
-                for _ in range(repeats + 1):
-                    ours = took(lambda keys=keys, bits=bits: sort_keys(launch, keys, bits))
-                    times.append((ours, took(lambda keys=keys: keys.sort(stable=True))))
-        except OUT_OF_MEMORY:
-            lacking.append(f"{count} keys do not fit into the memory")
-            continue
-        # The first turn warms up and is not counted.
-        ours, theirs = (statistics.median(each) for each in zip(*times[1:], strict=True))
+        keys = make_keys(count, min(bits, 31), device)
+        with launcher.on(device) as launch:
+            works = {
+                "ours": partial(milliseconds, partial(sort_keys, launch, keys, bits), device),
+                "torch": partial(milliseconds, partial(keys.sort, stable=True), device),
+            }
+            ours, theirs = (median(times) for times in in_turns(works, repeats, warm_up=1).values())
         found.append({"keys": count, "bits": bits, "ours_ms": ours, "torch_ms": theirs})
-    ratios = [f"{each['torch_ms'] / each['ours_ms']:.2f}x" for each in found]
-    says = f"the speed of torch.sort(stable=True) times {', '.join(ratios)}"
-    return {"says": "; ".join([says, *lacking]), "sorts": found}
+    ratios = ", ".join(f"{each['torch_ms'] / each['ours_ms']:.2f}" for each in found)
+    return {"says": f"our sort is this many times as fast as torch.sort: {ratios}", "sorts": found}
 
 
 def load() -> dict[str, Any]:
@@ -232,50 +177,20 @@ def ncu(tool: str) -> dict[str, Any]:
     command = [tool, "--clock-control", "none", *sections, "-k", COUNTED, "-c", str(COUNTED_KERNELS), "--csv"]
     command += [sys.executable, "-m", "gpu_run.on_device", "load"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
+    print(done.stdout, done.stderr)
     found = read_counters(done.stdout)
-    if found:
-        return {"says": f"counters of {len(found)} kernels at {SCENES[-1][0]:,} Gaussians", "counters": found}
-    lines = [line.strip() for line in (done.stdout + done.stderr).splitlines() if line.strip()]
-    errors = [line for line in lines if "ERR" in line or "error" in line.lower()]
-    reason = (errors or lines or ["no output"])[-1 if not errors else 0]
-    return {"says": f"ncu does not work on this machine: {reason}", "skipped": True}
+    return {"says": f"counters of {len(found)} launches", "failed": not found, "counters": found}
 
 
-def read_counters(text: str) -> list[dict[str, Any]]:
-    """Return the metrics of each kernel in the CSV that ``ncu`` prints; of many launches, the longest one."""
+def read_counters(text: str) -> list[dict[str, str]]:
+    """Return the metrics of each launch in the CSV that ``ncu`` prints."""
     lines = [line for line in text.splitlines() if line.startswith('"')]
-    launches: dict[str, dict[str, Any]] = {}
-    for row in csv.DictReader(io.StringIO("\n".join(lines))):
-        if row.get("Metric Name") in METRICS and row.get("ID") is not None:
-            launch = launches.setdefault(
-                row["ID"], {"kernel": row["Kernel Name"].partition("(")[0], "metrics": {}}
-            )
-            unit = row.get("Metric Unit") or ""
-            launch["metrics"].setdefault(row["Metric Name"], f"{row['Metric Value']} {unit}".strip())
-    longest: dict[str, dict[str, Any]] = {}
-    for launch in launches.values():
-        other = longest.get(launch["kernel"])
-        if other is None or _duration(launch) > _duration(other):
-            longest[launch["kernel"]] = launch
-    return list(longest.values())
-
-
-UNITS = {
-    "ns": 1e-6,
-    "nsecond": 1e-6,
-    "us": 1e-3,
-    "usecond": 1e-3,
-    "ms": 1.0,
-    "msecond": 1.0,
-    "s": 1e3,
-    "second": 1e3,
-}
-
-
-def _duration(launch: dict[str, Any]) -> float:
-    """Return the milliseconds of a launch."""
-    number, _, unit = launch["metrics"].get("Duration", "0 ms").partition(" ")
-    return float(number.replace(",", "")) * UNITS.get(unit, 1.0)
+    launches: dict[str, dict[str, str]] = {}
+    for row in csv.DictReader(lines):
+        if row.get("Metric Name") in METRICS:
+            launch = launches.setdefault(row["ID"], {"kernel": row["Kernel Name"].partition("(")[0]})
+            launch[row["Metric Name"]] = f"{row['Metric Value']} {row.get('Metric Unit') or ''}".strip()
+    return list(launches.values())
 
 
 def stages() -> dict[str, Any]:
@@ -312,13 +227,8 @@ def main(words: list[str] | None = None) -> int:
         result = WORK[args.name](*([args.tool] if args.tool else []))
     except Exception as error:
         # Whatever fails on an unknown machine becomes one line of the report; the log has the rest.
-        import traceback
-
         traceback.print_exc()
-        first = (str(error).strip().splitlines() or [""])[0]
-        # A UserError is a sentence already.
-        kind = type(error).__name__
-        result = {"says": first if kind == "UserError" else f"{kind}: {first}", "failed": True}
+        result = {"says": f"{type(error).__name__}: {error}".splitlines()[0], "failed": True}
     print(result.get("says", ""))
     if args.json:
         args.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

@@ -1,180 +1,219 @@
-"""One call of ``scripts/gpu.py``: looks at the machine, continues the record and runs the requested parts."""
+"""Run the pieces of a part one after another, keep what has passed, and write the record and its tables.
+
+The record is one JSON file: the machine, a hash of all that the results depend on, and the outcome of every
+piece in the order in which they ran.
+"""
 
 import hashlib
+import json
 import os
 import platform
-import shlex
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from datetime import datetime
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-try:
-    import fcntl
-except ImportError:
-    # Windows has no such locks.
-    fcntl = None
+from measuring import commit, first_line, processor, table
 
-from measuring import commit, first_line, processor
+from gpu_run.machine import REPOSITORY, Device, TroubleError, find_packages, find_tools, hash_sources
+from gpu_run.pieces import PARTS, RESULT, Piece, own, plan
 
-from gpu_run.machine import (
-    REPOSITORY,
-    Device,
-    TroubleError,
-    find_packages,
-    find_tools,
-    hash_sources,
-)
-from gpu_run.markdown import show, verdicts
-from gpu_run.pieces import CHECKS, PARTS, Setup, plan
-from gpu_run.record import ENDED, FAILED, Record, read_record
-from gpu_run.runner import RESULT, Piece, Processes, Runner
-
-# The interpreter of this run has the packages, and the one that is called python may not exist.
-AGAIN = f"{shlex.quote(sys.executable)} scripts/gpu.py"
-FACTS = (sys.executable, "-m", "gpu_run.on_device", "facts", "--json", RESULT)
+PASSED, FAILED, SKIPPED = "passed", "FAILED", "skipped"
 # The first import of torch from a slow disk takes long.
-FACTS_SECONDS = 60.0
+FACTS = Piece("machine", own("facts"), 60.0)
 # Finding the wrong stage includes compiling the emulator.
-STAGES_SECONDS = 50.0
-# Facts that results depend on, beside the files of the project.
-STATE = ("device", "driver", "driver_cuda", "torch", "python", "packages")
+STAGES = Piece("stages", own("stages"), 50.0)
+# A piece that has less time left than this is not started.
+LEAST_SECONDS = 15.0
+# A line of a log which says that the machine lacks something.
+LACKS = re.compile(r".*(?:No module named|OutOfMemoryError|out of memory|not supported|unable to).*")
+MOST_LETTERS = 300  # of a line in the report; the log has the rest
 
 
-@contextmanager
-def alone(folder: Path) -> Iterator[None]:
-    """Keep other runs out of the folder, because each would falsify the times and the record of the other.
-
-    Raises :class:`TroubleError` if another one is there. Its end frees the folder, whatever ends it.
-    """
+def run(folder: Path, device: Device, parts: list[str]) -> int:
+    """Run the parts in order and return the exit code. What has passed in the folder before is kept."""
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "lock").open("w") as lock:
-        if fcntl is not None:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise TroubleError(f"another run uses {folder}. Try: ps aux | grep gpu.py") from None
-        yield
+    # The processes import the project beside this script, and not another one that is installed.
+    os.environ["PYTHONPATH"] = os.pathsep.join((str(REPOSITORY), str(REPOSITORY / "scripts")))
+    record = begin(folder, device)
+    print(f"{device.name}, {record['machine']['torch']}: {folder}", flush=True)
+    for part in parts:
+        print(f"{part}, at most {PARTS[part] / 60:.0f} minutes:", flush=True)
+        pieces = plan_of(part, folder, device, record)
+        if part != "checks":
+            require_checks(plan_of("checks", folder, device, record), record)
+        if not run_part(part, pieces, folder, record):
+            print("A check has failed, so nothing is timed.")
+            run_piece(part, STAGES, STAGES.seconds, folder, record)
+            return 1
+    return int(any(entry["status"] == FAILED for entry in record["pieces"].values()))
 
 
-class Session:
-    """One call of the command line, which may continue the results of earlier calls."""
+def plan_of(part: str, folder: Path, device: Device, record: dict[str, Any]) -> list[Piece]:
+    """Return the pieces of a part on the machine of the record."""
+    found = record["machine"]["packages"] | record["machine"]["tools"]
+    return plan(part, folder, found, device.memory_bytes, os.cpu_count() or 1)
 
-    def __init__(self, folder: Path, device: Device, show_line: Callable[[str], None] | None = None) -> None:
-        self._folder, self._device = folder, device
-        self._show = show_line or (lambda line: print(line, flush=True))
-        self._processes = Processes(folder / "logs", REPOSITORY)
-        self._path = folder / "gpu.json"
-        paths = [str(REPOSITORY), str(REPOSITORY / "scripts"), os.environ.get("PYTHONPATH", "")]
-        # The processes import the project beside this script, and not another one that is installed.
-        os.environ["PYTHONPATH"] = os.pathsep.join(path for path in paths if path)
 
-    def run(self, parts: Sequence[str]) -> int:
-        """Run the parts in order, and return the exit code."""
-        with alone(self._folder):
-            return self._run(parts)
+def begin(folder: Path, device: Device) -> dict[str, Any]:
+    """Return the record of the folder if it still applies, and otherwise a new one.
 
-    def _run(self, parts: Sequence[str]) -> int:
-        machine = self._machine()
-        self._show(f"{machine['device']}, torch {machine['torch']}, Python {machine['python']}")
-        record = self._continue(machine)
+    Raises :class:`TroubleError` if torch cannot use the GPU.
+    """
+    status, says, facts = run_process(FACTS, FACTS.seconds, folder)
+    if status != PASSED:
+        raise TroubleError(f"{device.name}: {says}")
+    driver = first_line("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader")
+    machine = {**(facts or {}), "packages": find_packages(), "driver": driver}
+    machine |= {"device": device.name, "driver_cuda": device.driver_cuda, "python": platform.python_version()}
+    state = hashlib.sha256(f"{hash_sources()}{sorted(machine.items())}".encode()).hexdigest()[:16]
+    machine |= {"processor": processor(), "commit": commit(), "tools": find_tools()}
+    path = folder / "gpu.json"
+    pieces = {}
+    if path.is_file():
+        old = json.loads(path.read_text(encoding="utf-8"))
+        if old["state"] == state:
+            pieces = old["pieces"]
+        else:
+            path.replace(path.with_name(f"gpu-{old['state']}.json"))
+            print("The GPU, a package or a file of the project has changed. Everything is measured again.")
+    return {"machine": machine, "state": state, "pieces": pieces}
+
+
+def require_checks(checks: list[Piece], record: dict[str, Any]) -> None:
+    """Raise :class:`TroubleError` unless all gates have passed or cannot run here."""
+    missing = [
+        piece.name
+        for piece in checks
+        if piece.is_gate and record["pieces"].get(piece.name, {}).get("status") not in (PASSED, SKIPPED)
+    ]
+    if missing:
+        raise TroubleError(f"expected that the checks have passed, got no pass of {', '.join(missing)}")
+
+
+def run_part(part: str, pieces: list[Piece], folder: Path, record: dict[str, Any]) -> bool:
+    """Run the pieces that have not passed; return ``False`` as soon as a gate fails."""
+    deadline = time.monotonic() + PARTS[part]
+    for piece in pieces:
+        left = deadline - time.monotonic()
+        if record["pieces"].get(piece.name, {}).get("status") == PASSED:
+            print(f"  {piece.name}: kept")
+        elif left < LEAST_SECONDS:
+            print(f"  {piece.name}: not started, because the time of this part is over")
+        elif run_piece(part, piece, left, folder, record) == FAILED and piece.is_gate:
+            return False
+    return True
+
+
+def run_piece(part: str, piece: Piece, left: float, folder: Path, record: dict[str, Any]) -> str:
+    """Run a piece within the time that is left, write its outcome to the record, and return its status."""
+    machine, started = record["machine"], time.monotonic()
+    missing = [name for name in piece.needs if name not in machine["packages"] | machine["tools"]]
+    if missing:
+        status, says, result = SKIPPED, f"not installed: {', '.join(missing)}", None
+    else:
+        status, says, result = run_process(piece, min(left, piece.seconds), folder)
+    print(f"  {piece.name}: {status}, {says}", flush=True)
+    # A piece that runs again moves to the end, so the order is that of the run.
+    record["pieces"].pop(piece.name, None)
+    seconds = round(time.monotonic() - started, 1)
+    record["pieces"][piece.name] = {"part": part, "status": status, "says": says, "seconds": seconds}
+    record["pieces"][piece.name]["result"] = result
+    unfinished = folder / "gpu.part"
+    unfinished.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    unfinished.replace(folder / "gpu.json")
+    (folder / "gpu.md").write_text(markdown(record), encoding="utf-8")
+    return status
+
+
+def run_process(piece: Piece, seconds: float, folder: Path) -> tuple[str, str, dict[str, Any] | None]:
+    """Return the status of a piece, one line about it and its results. It is ended after ``seconds``."""
+    logs = folder / "logs"
+    logs.mkdir(exist_ok=True)
+    log, path = (logs / f"{piece.name.replace(' ', '_')}{suffix}" for suffix in (".log", ".json"))
+    path.unlink(missing_ok=True)
+    with log.open("wb") as sink:
+        process = subprocess.Popen(
+            [word.replace(RESULT, str(path)) for word in piece.command],
+            stdin=subprocess.DEVNULL,
+            stdout=sink,
+            stderr=subprocess.STDOUT,
+            cwd=REPOSITORY,
+            env={**os.environ, **piece.environment},
+            start_new_session=True,
+        )
         try:
-            for part in parts:
-                if part != CHECKS:
-                    self._require_checks(record)
-                self._show(f"{part}, at most {PARTS[part] / 60:.0f} minutes:")
-                if not self.run_part(record, part):
-                    self._show("The checks have failed, so nothing is timed.")
-                    return 1
+            code = process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            code = None
         finally:
-            self._finish(record)
-        is_whole = all(entry.status not in (FAILED, ENDED) for entry in record.pieces.values())
-        return 0 if is_whole else 1
+            # The children of the process are in its group.
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+    result = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+    return (*judge(piece, code, log.read_text(encoding="utf-8", errors="replace"), result), result)
 
-    def run_part(self, record: Record, part: str) -> bool:
-        """Run one part; if a check fails, find out which stage of the kernels is wrong."""
-        pieces = plan(self._setup(record), part)
-        runner = Runner(record, self._path, self._processes, self._show)
-        if runner.run(part, pieces, PARTS[part]):
-            return True
-        stages = self._setup(record).own("stages")
-        runner.run(CHECKS, [Piece("stages", CHECKS, stages, STAGES_SECONDS)], STAGES_SECONDS)
-        return False
 
-    def _setup(self, record: Record) -> Setup:
-        found = record.machine
-        return Setup(
-            self._folder,
-            found["tools"],
-            found["packages"],
-            found["memory_bytes"],
-            os.cpu_count() or 1,
-            record,
-        )
+def judge(piece: Piece, code: int | None, log: str, result: dict[str, Any] | None) -> tuple[str, str]:
+    """Return the status of a piece that has ended, and one line about it; the code is ``None`` if it hung."""
+    lines = [line.strip(" =") for line in log.splitlines() if line.strip(" =")] or ["no output"]
+    if code is None:
+        return FAILED, f"ended by its time limit; its last line: {lines[-1][:MOST_LETTERS]}"
+    found = [line for line in lines if piece.expects and re.search(piece.expects, line)]
+    says = (result or {}).get("says") or (found or lines)[-1]
+    if code == 0 and (found or not piece.expects):
+        return PASSED, says[:MOST_LETTERS]
+    if not piece.is_gate and (lacking := LACKS.search(log)):
+        return SKIPPED, lacking[0].strip()[:MOST_LETTERS]
+    return FAILED, f"exit code {code}: {says[:MOST_LETTERS]}"
 
-    def _machine(self) -> dict[str, Any]:
-        """Return everything about the machine. Raises :class:`TroubleError` if torch cannot use the GPU."""
-        packages = find_packages()
-        if "torch" not in packages:
-            raise TroubleError(
-                f"expected torch in {sys.executable}, got none. Try: {sys.executable} -m pip install torch"
-            )
-        piece = Piece("machine", CHECKS, FACTS, FACTS_SECONDS)
-        finished = self._processes.wait(self._processes.start(piece), FACTS_SECONDS)
-        says = f"torch does not start: {finished.last_line}"
-        if finished.code is None:
-            # What is read from a disk once is read faster the next time.
-            says = f"torch has not started in {FACTS_SECONDS:.0f} s. Try: {AGAIN}"
-        facts = finished.result or {"trouble": says}
-        if trouble := facts.pop("trouble", None):
-            raise TroubleError(f"{self._device.name}: {trouble}")
-        facts |= {
-            "driver": first_line("nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"),
-            "driver_cuda": self._device.driver_cuda,
-            "devices": self._device.count,
-            "processor": processor(),
-            "python": platform.python_version(),
-            "system": platform.platform(),
-            "commit": commit(),
-            "date": datetime.now().astimezone().isoformat(timespec="seconds"),
-            "tools": find_tools(),
-            "packages": packages,
-        }
-        return facts
 
-    def _continue(self, machine: dict[str, Any]) -> Record:
-        """Return the record of the folder if it still applies, and otherwise a new one."""
-        parts = [hash_sources(), *(str(machine[key]) for key in STATE)]
-        state = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
-        if not self._path.exists():
-            return Record(machine, state)
-        record = read_record(self._path)
-        if record.state == state:
-            return Record(machine, state, record.pieces)
-        old = self._path.with_name(f"gpu-{record.machine['date'].replace(':', '')[:17]}.json")
-        self._path.replace(old)
-        self._show(
-            f"The GPU, a package or a file of the project has changed. The old results are in {old.name}."
-        )
-        return Record(machine, state)
+def markdown(record: dict[str, Any]) -> str:
+    """Return the record as Markdown: the machine, the outcomes, and a table for each list of results."""
+    machine = [{"machine": name, "": cell(value)} for name, value in record["machine"].items()]
+    pieces = record["pieces"]
+    outcomes = [
+        {"piece": name, "status": entry["status"], "says": entry["says"].replace("|", "/")}
+        for name, entry in pieces.items()
+    ]
+    texts = [table(machine), table(outcomes)]
+    for name, entry in pieces.items():
+        for rows in filter(is_table, (entry["result"] or {}).values()):
+            shown = [{key: cell(value) for key, value in row.items()} for row in rows]
+            texts.append(f"{name}\n\n{table(shown)}")
+    fastest = [{key: cell(value) for key, value in row.items()} for row in fastest_backends(record)]
+    texts += [f"Fastest backends\n\n{table(fastest)}"] if fastest else []
+    return "\n\n".join([*texts, "Measured with `python scripts/gpu.py`; times are medians in ms.\n"])
 
-    def _require_checks(self, record: Record) -> None:
-        gates = [piece for piece in plan(self._setup(record), CHECKS) if piece.is_gate and not piece.missing]
-        open_gates = [piece.name for piece in gates if not record.passed(piece.name)]
-        if open_gates:
-            raise TroubleError(
-                f"expected that the checks have passed, got no pass of: {', '.join(open_gates)}. "
-                f"Try: {AGAIN} --part checks"
-            )
 
-    def _finish(self, record: Record) -> None:
-        record.machine["fastest"] = verdicts(record)
-        record.write(self._path)
-        text = show(record)
-        self._path.with_suffix(".md").write_text(text, encoding="utf-8")
-        statuses = [entry.status for entry in record.pieces.values()]
-        counts = {status: statuses.count(status) for status in dict.fromkeys(statuses)}
-        summary = ", ".join(f"{count} {status}" for status, count in counts.items()) or "nothing has run"
-        self._show(f"{summary}. Results: {self._path} and {self._path.with_suffix('.md').name}")
+def is_table(value: object) -> bool:
+    """Return whether a result is a list of rows."""
+    return isinstance(value, list) and bool(value) and all(isinstance(row, dict) for row in value)
+
+
+def cell(value: object) -> str:
+    """Return a value of the record for a cell of a table."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {cell(each)}" for name, each in value.items())
+    if isinstance(value, list):
+        return " ".join(map(cell, value))
+    return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
+
+
+def fastest_backends(record: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the fastest backend of each timed scene, and whether it is the choice of ``rasterizer=auto``."""
+    results = {name: entry["result"] or {} for name, entry in record["pieces"].items()}
+    auto = results.get("choice of auto", {}).get("backend")
+    scenes: dict[tuple[int, ...], list[dict[str, Any]]] = {}
+    for row in (row for result in results.values() for row in result.get("rows", [])):
+        if row["step_ms"] is not None:
+            scenes.setdefault(tuple(row[key] for key in ("count", "size", "views", "degree")), []).append(row)
+    for (count, size, views, degree), rows in scenes.items():
+        first = min(rows, key=lambda row: row["step_ms"])["backend"]
+        scene = {"count": count, "size": size, "views": views, "degree": degree}
+        yield {**scene, "fastest": first, "choice of auto": auto, "is_auto_fastest": first == auto}

@@ -7,7 +7,6 @@ from typing import Any
 from prior_training import samples
 from prior_training.autoencoder import GROUPS as AUTOENCODER_GROUPS
 from prior_training.denoiser import IMAGES, LEVELS
-from prior_training.figures import write_curves
 from prior_training.stages import Plan, curves, prior_of
 from prior_training.text import vocabulary
 from prior_training.world import COLOURS, NOUNS, PATTERNS, RELATIONS, VIEWS, held_out_captions
@@ -41,10 +40,9 @@ TEMPLATE = Path(__file__).with_name("card.md")
 
 
 def write_card(plan: Plan) -> None:
-    """Write README.md, vocabulary.json, samples.png and curves.png into the folder of the model."""
+    """Write README.md, vocabulary.json and samples.png into the folder of the model."""
     (plan.out / "vocabulary.json").write_text(json.dumps(vocabulary(), indent=1) + "\n", encoding="utf-8")
     _write_samples(plan)
-    write_curves(curves(plan), plan.out / "curves.png")
     (plan.out / "README.md").write_text(_card(plan), encoding="utf-8")
 
 

@@ -101,8 +101,6 @@ def _text_encoder(tokens: int, width: int, projected: bool = False) -> nn.Module
 class StableDiffusionFormat(Format):
     """A UNet over four latent channels on the DDPM schedule, with one CLIP text encoder."""
 
-    prediction: str = "v_prediction"  # or epsilon
-
     name: ClassVar[str] = "stable_diffusion"
     channels: ClassVar[tuple[int, ...]] = (64, 128)  # of the blocks of the UNet
     latent_channels: ClassVar[int] = 4
@@ -110,7 +108,7 @@ class StableDiffusionFormat(Format):
     @property
     def target(self) -> str:
         """Return the prediction type of the scheduler."""
-        return self.prediction
+        return "v_prediction"
 
     def build(self, tokens: int) -> nn.ModuleDict:
         """Return a UNet and a text encoder."""
@@ -137,7 +135,7 @@ class StableDiffusionFormat(Format):
     @property
     def scheduler(self) -> dict[str, Any]:
         """Return the configuration of the noise schedule."""
-        return {**BETAS, "num_train_timesteps": TRAIN_STEPS, "prediction_type": self.prediction}
+        return {**BETAS, "num_train_timesteps": TRAIN_STEPS, "prediction_type": self.target}
 
     def noised(self, latents: Tensor, noise: Tensor, level: Tensor) -> Noised:
         """Add noise at whole timesteps of the DDPM schedule (Ho et al. 2020)."""
@@ -145,8 +143,7 @@ class StableDiffusionFormat(Format):
         kept = torch.cumprod(1 - betas, 0).to(latents)
         timestep = (level * TRAIN_STEPS).long()
         a, b = (x[timestep][:, None, None, None] for x in (kept.sqrt(), (1 - kept).sqrt()))
-        velocity = a * noise - b * latents
-        return Noised(a * latents + b * noise, timestep, noise if self.prediction == "epsilon" else velocity)
+        return Noised(a * latents + b * noise, timestep, a * noise - b * latents)
 
     def predict(self, model: nn.ModuleDict, noised: Noised, numbers: Tensor, cameras: Tensor) -> Tensor:
         """Run the UNet with text cross-attention."""

@@ -12,7 +12,7 @@ import torch
 from diffusers import AutoencoderKL
 from prior_training import autoencoder, loop
 from prior_training.denoiser import Denoising, Encoded
-from prior_training.formats import FORMATS, Format
+from prior_training.formats import Format
 from prior_training.text import tokenizer
 from prior_training.views import Groups, file_count, load_held_out, load_views, render_views
 from safetensors.torch import load_file, save_file
@@ -240,9 +240,3 @@ def _in_processes(function: Callable[..., None], plan: Plan, *rest: Any) -> None
         function(0, plan, *rest)
     else:
         spawn(function, (plan, *rest), nprocs=plan.processes)
-
-
-def format_of(name: str, size: int, prediction: str) -> Format:
-    """Return the format of that name."""
-    kind = FORMATS[name]
-    return kind(size=size) if name == "stable_diffusion_3" else kind(size=size, prediction=prediction)

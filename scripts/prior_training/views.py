@@ -88,12 +88,6 @@ def load_held_out(folder: Path) -> Groups:
     return _read(folder / HELD_OUT_FILE)
 
 
-def size_of(folder: Path) -> int | None:
-    """Return the pixels per side of the views in a folder; None if it has none yet."""
-    path = _file(folder, 0)
-    return _read(path).rgba.shape[-1] if path.is_file() else None
-
-
 def _file(folder: Path, number: int) -> Path:
     return folder / f"views_{number:04d}.pt"
 

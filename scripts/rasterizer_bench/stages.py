@@ -8,16 +8,16 @@ speed of a plain copy. It considers bandwidth alone, so a stage that computes mu
 do, stays far above it. It also assumes that no tile becomes opaque before the end of its list.
 """
 
-import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float
-from measuring import now
+from measuring import in_turns, median, milliseconds, now
 from rasterizer_bench.scenes import Scene
 from torch import Tensor
 
@@ -87,10 +87,6 @@ class Kernel:
     ms: float
 
 
-# Calls a function, and returns what the device has run for it, in order.
-Watch = Callable[[Callable[[], object]], list[Kernel]]
-
-
 def profile(work: Callable[[], object]) -> list[Kernel]:
     """Return the kernels and copies of ``work``, timed by the GPU.
 
@@ -133,7 +129,7 @@ class LaunchClock(Launcher):
         self.launches.append(Kernel(kernel, (time.perf_counter() - begin) * 1e3))
 
     def watch(self, work: Callable[[], object]) -> list[Kernel]:
-        """Return the launches of ``work``; see :data:`Watch`."""
+        """Return the launches of ``work``."""
         self.reset()
         work()
         return self.launches
@@ -216,76 +212,55 @@ def stage_bytes(load: Load) -> dict[str, int]:
 
 
 @dataclass(frozen=True)
-class StageTiming:
-    """One stage of one scene."""
-
-    stage: str
-    launches: int
-    median_ms: float
-    bytes: int | None  # None for ``TORCH`` and ``REST``
-    floor_ms: float | None  # None for ``TORCH`` and ``REST``
-
-
-@dataclass(frozen=True)
 class SceneTiming:
     """All stages of one scene, forward and backward."""
 
-    stages: list[StageTiming]
+    # Each with its name, launches, ``median_ms``, and the least ``bytes`` and their time ``floor_ms``.
+    stages: list[dict[str, Any]]
     wall_ms: float  # without the profiler
     kernel_ms: float  # the sum of all kernels and copies
 
 
-def time_stages(
-    launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: float, watch: Watch | None = None
-) -> SceneTiming:
+def time_stages(launcher: Launcher, scene: Scene, repeats: int, bytes_per_ms: float) -> SceneTiming:
     """Return the times of all stages, as medians; the last two are ``TORCH`` and ``REST``.
 
-    On CUDA, ``watch`` is the profiler by default. Elsewhere, launches are timed. Raises
-    :class:`NoKernelsError` if not every launch was seen.
+    On CUDA, the profiler times kernels. Elsewhere, launches are timed. Raises :class:`NoKernelsError` if not
+    every launch was seen.
     """
     clock, device = LaunchClock(launcher), scene.gaussians.device
-    watch = watch or (profile if device.type == "cuda" else clock.watch)
-    wall = _time_wall(launcher, scene, repeats)
-    samples, launches = [], {}
-    for _ in range(repeats):
-        clock.reset()
-        scene.zero_grad()
-        seen = watch(lambda: scene.backward(scene.render(KernelRasterizer(clock))))
-        stages = stages_of([kernel.name for kernel in seen])
-        launches = {stage: stages.count(stage) for stage in stages}
-        ours = len(stages) - launches.get(TORCH, 0)
-        if ours != len(clock.launches):
-            raise NoKernelsError(f"torch.profiler has seen {ours} of {len(clock.launches)} kernels")
-        times = dict.fromkeys((*STAGES, TORCH), 0.0)
-        for stage, kernel in zip(stages, seen, strict=True):
-            times[stage] += kernel.ms
-        samples.append(times)
-    medians = {stage: statistics.median(times[stage] for times in samples) for stage in samples[0]}
-    kernel_ms = sum(medians.values())
-    needed = stage_bytes(measure_load(KernelRasterizer(launcher), scene, clock.slots))
-    timings = [
-        StageTiming(
-            stage,
-            launches.get(stage, 0),
-            milliseconds,
-            needed.get(stage),
-            needed[stage] / bytes_per_ms if stage in needed else None,
-        )
-        for stage, milliseconds in (medians | {REST: wall - kernel_ms}).items()
-    ]
-    return SceneTiming(timings, wall, kernel_ms)
+    watch = profile if device.type == "cuda" else clock.watch
+    plain, timed = KernelRasterizer(launcher), KernelRasterizer(clock)
 
-
-def _time_wall(launcher: Launcher, scene: Scene, repeats: int) -> float:
-    """Return the median of the wall clock of forward and backward in ms, without profiler and clocks."""
-    rasterizer, device, times = KernelRasterizer(launcher), scene.gaussians.device, []
-    for _ in range(repeats + 1):
+    def run(rasterizer: Rasterizer) -> None:
         scene.zero_grad()
-        start = now(device)
         scene.backward(scene.render(rasterizer))
-        times.append((now(device) - start) * 1e3)
-    # The first one warms up and is not counted.
-    return statistics.median(times[1:])
+
+    def time_kernels() -> dict[str, list[float]]:
+        clock.reset()
+        seen = watch(lambda: run(timed))
+        times: dict[str, list[float]] = {stage: [] for stage in (*STAGES, TORCH)}
+        for stage, kernel in zip(stages_of([kernel.name for kernel in seen]), seen, strict=True):
+            times[stage].append(kernel.ms)
+        if len(seen) - len(times[TORCH]) != len(clock.launches):
+            raise NoKernelsError(f"torch.profiler has not seen all {len(clock.launches)} kernels")
+        return times
+
+    wall = median(in_turns({"": lambda: milliseconds(lambda: run(plain), device)}, repeats, warm_up=1)[""])
+    samples = [time_kernels() for _ in range(repeats)]
+    medians = {stage: median([sum(sample[stage]) for sample in samples]) for stage in samples[0]}
+    kernel_ms = sum(medians.values())
+    needed = stage_bytes(measure_load(plain, scene, clock.slots))
+    rows = [
+        {
+            "stage": stage,
+            "launches": len(samples[-1].get(stage, ())),
+            "median_ms": ms,
+            "bytes": needed.get(stage),
+            "floor_ms": needed[stage] / bytes_per_ms if stage in needed else None,
+        }
+        for stage, ms in (medians | {REST: wall - kernel_ms}).items()
+    ]
+    return SceneTiming(rows, wall, kernel_ms)
 
 
 def measure_load(rasterizer: Rasterizer, scene: Scene, slots: int) -> Load:

@@ -1,62 +1,45 @@
 """Measure the time and the memory of the phases of a step."""
 
-import statistics
-from dataclasses import dataclass
+from typing import Any
 
 import torch
-from measuring import now
+from measuring import median, now
 from rasterizer_bench.scenes import Scene
 
 from cadam3d.rasterizer.base import Rasterizer
 
-# ``step`` is forward and backward as a training step calls them. ``host`` is the part of it in which the host
-# is busy, until it waits for the device.
-PHASES = ("forward", "backward", "forward_backward", "step", "host")
 OUT_OF_MEMORY = (torch.OutOfMemoryError, MemoryError)
 
 
-@dataclass(frozen=True)
-class Timing:
-    """The times of one backend on one scene, over all repetitions."""
-
-    median_ms: dict[str, float]  # by phase
-    peak_bytes: int | None  # without the scene itself; None if it cannot be measured
-
-
-def take_turns(backends: dict[str, Rasterizer], scene: Scene, repeats: int) -> dict[str, Timing | None]:
-    """Return the timing of every backend, and ``None`` for those that ran out of memory.
+def take_turns(
+    backends: dict[str, Rasterizer], scene: Scene, repeats: int
+) -> dict[str, dict[str, Any] | None]:
+    """Return the median times and the memory of every backend, and ``None`` for one that lacks memory.
 
     Backends take turns within each repetition, so other load on the machine affects all of them alike. The
     first round is not counted: it warms up and measures memory.
     """
-    samples: dict[str, list[dict[str, float]]] = {name: [] for name in backends}
-    peaks: dict[str, int | None] = {}
+    samples: dict[str, list[dict[str, Any]]] = {name: [] for name in backends}
     failed: set[str] = set()
-    for repeat in range(repeats + 1):
-        for name, rasterizer in backends.items():
-            if name in failed:
-                continue
+    for _ in range(repeats + 1):
+        for name in [each for each in backends if each not in failed]:
             try:
-                if repeat == 0:
-                    peaks[name] = peak_memory(rasterizer, scene)
-                else:
-                    samples[name].append(time_phases(rasterizer, scene))
+                is_first = not samples[name]
+                measure = peak_memory if is_first else time_phases
+                samples[name].append(measure(backends[name], scene))
             except OUT_OF_MEMORY:
                 failed.add(name)
             scene.zero_grad()
-    return {name: None if name in failed else summarize(samples[name], peaks[name]) for name in backends}
-
-
-def summarize(samples: list[dict[str, float]], peak: int | None) -> Timing:
-    """Return the median time of each phase, with the peak of memory."""
-    return Timing({phase: statistics.median(each[phase] for each in samples) for phase in PHASES}, peak)
+    return {
+        name: None if name in failed else samples[name][0] | median(samples[name][1:]) for name in backends
+    }
 
 
 def time_phases(rasterizer: Rasterizer, scene: Scene) -> dict[str, float]:
     """Return the milliseconds of each phase.
 
-    Forward and backward together are timed separately, without waiting for the device between them, and once
-    more as a training step calls them.
+    ``step_ms`` is forward and backward as a training step calls them. ``host_ms`` is the part of it in which
+    the host is busy, until it waits for the device.
     """
     device = scene.gaussians.device
     scene.zero_grad()
@@ -67,32 +50,22 @@ def time_phases(rasterizer: Rasterizer, scene: Scene) -> dict[str, float]:
     end = now(device)
     del images
     scene.zero_grad()
-    again = now(device)
-    scene.backward(scene.render(rasterizer))
-    whole = now(device) - again
-    scene.zero_grad()
     start_of_step = now(device)
     host = scene.step(rasterizer)
     step = now(device) - start_of_step
-    return {
-        "forward": (middle - start) * 1e3,
-        "backward": (end - middle) * 1e3,
-        "forward_backward": whole * 1e3,
-        "step": step * 1e3,
-        "host": host * 1e3,
-    }
+    times = {"step": step, "forward": middle - start, "backward": end - middle, "host": host}
+    return {f"{phase}_ms": seconds * 1e3 for phase, seconds in times.items()}
 
 
-def peak_memory(rasterizer: Rasterizer, scene: Scene) -> int | None:
+def peak_memory(rasterizer: Rasterizer, scene: Scene) -> dict[str, int | None]:
     """Return the peak of bytes of forward and backward, including the gradients of the parameters.
 
-    It covers both ways to render, because the second one reserves memory ahead.
-
-    Torch counts its allocations on a CUDA device exactly. On a CPU the system counts pages, and the allocator
-    keeps freed memory, so the result would be unreliable and is ``None``.
+    It covers both ways to render, because the second one reserves memory ahead. Torch counts its allocations
+    on a CUDA device exactly. On a CPU the result would be unreliable and is ``None``.
     """
     device = scene.gaussians.device
     scene.zero_grad()
+    before = 0
     if device.type == "cuda":
         torch.cuda.synchronize(device)
         before = torch.cuda.memory_allocated(device)
@@ -101,6 +74,6 @@ def peak_memory(rasterizer: Rasterizer, scene: Scene) -> int | None:
     scene.zero_grad()
     scene.step(rasterizer)
     if device.type != "cuda":
-        return None
+        return {"peak_bytes": None}
     torch.cuda.synchronize(device)
-    return torch.cuda.max_memory_allocated(device) - before
+    return {"peak_bytes": torch.cuda.max_memory_allocated(device) - before}
