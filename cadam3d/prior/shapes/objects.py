@@ -6,6 +6,7 @@ of an object do not matter, since ``natural`` defines its size relative to other
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -96,13 +97,18 @@ def known_objects() -> tuple[str, ...]:
 def thing(name: str) -> Thing:
     """Return the object of that name, a key of PRIMITIVES or COMPOSED."""
     if name in PRIMITIVES:
-        return Thing((Part(PRIMITIVES[name], Coat(MAIN, ACCENT)),), OPEN, "white")
+        return Thing(_painted(MAIN, PRIMITIVES[name]), OPEN, "white")
     return COMPOSED[name]()
 
 
-def _p(solid: Solid, first: str, second: str = ACCENT, pattern: str = PLAIN) -> Part:
-    """Return a painted part; the name is short, since the objects below consist of hundreds of parts."""
-    return Part(solid, Coat(first, second, pattern))
+def _painted(colour: str, *solids: Solid) -> tuple[Part, ...]:
+    """Return parts of one colour."""
+    return tuple(Part(solid, Coat(colour, ACCENT)) for solid in solids)
+
+
+def _thing(main: str, accent: str, natural: float, *groups: tuple[Part, ...], **room: Any) -> Thing:
+    """Return the object of these groups of parts. The order of parts of one kind decides the last bits."""
+    return Thing(tuple(part for group in groups for part in group), main, accent, natural, **room)
 
 
 def _lighthouse() -> Thing:
@@ -116,269 +122,269 @@ def _lighthouse() -> Thing:
     for i in range(bands):
         bottom, top = base + height * i / bands, base + height * (i + 1) / bands
         slab = frustum(radius(bottom), radius(top), top - bottom).at(z=(bottom + top) / 2)
-        tower.append(_p(slab, MAIN if i % 2 == 0 else ACCENT))
+        tower.append(_painted(ACCENT if i % 2 else MAIN, slab))
     deck = base + height
-    rocks = [
-        _p(ellipsoid(0.72, 0.70, 0.20), "grey"),
-        _p(ellipsoid(0.26, 0.22, 0.20).at(0.42, 0.40, 0.05), "charcoal"),
-        _p(ellipsoid(0.24, 0.27, 0.17).at(-0.42, -0.36, 0.06), "charcoal"),
-        _p(ellipsoid(0.20, 0.20, 0.15).at(0.40, -0.46, 0.03), "charcoal"),
-    ]
-    lantern = [
-        _p(cylinder(0.37, 0.06).at(z=deck + 0.03), "charcoal"),
-        _p(torus(0.35, 0.018).at(z=deck + 0.19), "charcoal"),
-        _p(cylinder(0.17, 0.30).at(z=deck + 0.20), "yellow"),
-        _p(cone(0.27, 0.24).at(z=deck + 0.46), MAIN),
-        _p(ball(0.045).at(z=deck + 0.60), "charcoal"),
-    ]
-    rail = [
-        _p(cylinder(0.016, 0.16).at(0.35).turned("z", 45.0 * i).at(z=deck + 0.12), "charcoal")
-        for i in range(8)
-    ]
-    bars = [
-        _p(cylinder(0.02, 0.30).at(0.17).turned("z", 60.0 * i).at(z=deck + 0.20), "charcoal")
-        for i in range(6)
-    ]
-    door = [
-        _p(box(0.10, 0.17, 0.26).at(0.37, 0, base + 0.17), "brown"),
-        _p(cylinder(0.085, 0.10).turned("y", 90).at(0.37, 0, base + 0.30), "brown"),
-    ]
+    rail = [cylinder(0.016, 0.16).at(0.35).turned("z", 45.0 * i).at(z=deck + 0.12) for i in range(8)]
+    bars = [cylinder(0.02, 0.30).at(0.17).turned("z", 60.0 * i).at(z=deck + 0.20) for i in range(6)]
     windows = [
-        _p(box(0.08, 0.09, 0.13).at(radius(z) - 0.02, 0, z).turned("z", angle), "navy")
+        box(0.08, 0.09, 0.13).at(radius(z) - 0.02, 0, z).turned("z", angle)
         for z, angle in ((0.90, 0.0), (1.36, 0.0), (0.72, 180.0), (1.20, 180.0), (1.05, 90.0), (1.05, -90.0))
     ]
-    return Thing((*tower, *rocks, *lantern, *rail, *bars, *door, *windows), "red", "white", natural=1.8)
+    return _thing(
+        "red",
+        "white",
+        1.8,
+        *tower,
+        _painted("grey", ellipsoid(0.72, 0.70, 0.20)),
+        _painted(
+            "charcoal",
+            ellipsoid(0.26, 0.22, 0.20).at(0.42, 0.40, 0.05),
+            ellipsoid(0.24, 0.27, 0.17).at(-0.42, -0.36, 0.06),
+            ellipsoid(0.20, 0.20, 0.15).at(0.40, -0.46, 0.03),
+            cylinder(0.37, 0.06).at(z=deck + 0.03),
+            torus(0.35, 0.018).at(z=deck + 0.19),
+            ball(0.045).at(z=deck + 0.60),
+        ),
+        _painted("yellow", cylinder(0.17, 0.30).at(z=deck + 0.20)),
+        _painted(MAIN, cone(0.27, 0.24).at(z=deck + 0.46)),
+        _painted("charcoal", *rail, *bars),
+        _painted(
+            "brown",
+            box(0.10, 0.17, 0.26).at(0.37, 0, base + 0.17),
+            cylinder(0.085, 0.10).turned("y", 90).at(0.37, 0, base + 0.30),
+        ),
+        _painted("navy", *windows),
+    )
 
 
 def _snowman() -> Thing:
     head = 1.42
-    return Thing(
-        (
-            _p(ball(0.50).at(z=0.46), MAIN),
-            _p(ball(0.37).at(z=1.03), MAIN),
-            _p(ball(0.27).at(z=head), MAIN),
-            _p(cone(0.07, 0.34).turned("y", 90).at(0.40, 0, head), "orange"),
-            *(_p(ball(0.045).at(0.235, y, head + 0.10), "black") for y in (-0.10, 0.10)),
-            *(_p(ball(0.045).at(x, 0, z), "black") for x, z in ((0.35, 1.14), (0.36, 0.98), (0.46, 0.65))),
-            _p(cylinder(0.31, 0.045).at(z=head + 0.215), "black"),
-            _p(cylinder(0.20, 0.30).at(z=head + 0.37), "black"),
-            _p(cylinder(0.207, 0.07).at(z=head + 0.275), ACCENT),
-            _p(torus(0.25, 0.065).at(z=1.225), ACCENT),
-            _p(box(0.07, 0.12, 0.30).turned("y", -8).at(0.37, 0.16, 1.06), ACCENT),
-            *(
-                _p(capsule(0.03, 0.62).turned("x", -58 * side).at(0, 0.56 * side, 1.18), "brown")
-                for side in (-1, 1)
-            ),
-            *(
-                _p(capsule(0.022, 0.20).turned("x", -10 * side).at(0, 0.72 * side, 1.34), "brown")
-                for side in (-1, 1)
-            ),
-        ),
+    eyes = [ball(0.045).at(0.235, y, head + 0.10) for y in (-0.10, 0.10)]
+    buttons = [ball(0.045).at(x, 0, z) for x, z in ((0.35, 1.14), (0.36, 0.98), (0.46, 0.65))]
+    arms = [capsule(0.03, 0.62).turned("x", -58 * side).at(0, 0.56 * side, 1.18) for side in (-1, 1)]
+    hands = [capsule(0.022, 0.20).turned("x", -10 * side).at(0, 0.72 * side, 1.34) for side in (-1, 1)]
+    return _thing(
         "white",
         "red",
+        1.0,
+        _painted(MAIN, ball(0.50).at(z=0.46), ball(0.37).at(z=1.03), ball(0.27).at(z=head)),
+        _painted("orange", cone(0.07, 0.34).turned("y", 90).at(0.40, 0, head)),
+        _painted(
+            "black",
+            *eyes,
+            *buttons,
+            cylinder(0.31, 0.045).at(z=head + 0.215),
+            cylinder(0.20, 0.30).at(z=head + 0.37),
+        ),
+        _painted(
+            ACCENT,
+            cylinder(0.207, 0.07).at(z=head + 0.275),
+            torus(0.25, 0.065).at(z=1.225),
+            box(0.07, 0.12, 0.30).turned("y", -8).at(0.37, 0.16, 1.06),
+        ),
+        _painted("brown", *arms, *hands),
     )
 
 
 def _chair() -> Thing:
-    legs = [_p(box(0.10, 0.10, 0.62).at(x, y, 0.31), ACCENT) for x in (-0.34, 0.34) for y in (-0.34, 0.34)]
-    posts = [_p(box(0.09, 0.09, 0.86).at(-0.345, y, 1.10), ACCENT) for y in (-0.34, 0.34)]
-    slats = [_p(box(0.06, 0.62, 0.13).at(-0.345, 0, z), MAIN) for z in (0.98, 1.20, 1.43)]
-    rungs = [_p(box(0.06, 0.60, 0.06).at(x, 0, 0.24), ACCENT) for x in (-0.34, 0.34)]
-    seat = _p(box(0.84, 0.86, 0.11).at(0.01, 0, 0.66), MAIN)
-    return Thing(
-        (seat, *legs, *posts, *slats, *rungs), "orange", "brown", 0.9, seat=0.715, shelter=(0.25, 0.60)
+    legs = [box(0.10, 0.10, 0.62).at(x, y, 0.31) for x in (-0.34, 0.34) for y in (-0.34, 0.34)]
+    posts = [box(0.09, 0.09, 0.86).at(-0.345, y, 1.10) for y in (-0.34, 0.34)]
+    slats = [box(0.06, 0.62, 0.13).at(-0.345, 0, z) for z in (0.98, 1.20, 1.43)]
+    rungs = [box(0.06, 0.60, 0.06).at(x, 0, 0.24) for x in (-0.34, 0.34)]
+    return _thing(
+        "orange",
+        "brown",
+        0.9,
+        _painted(MAIN, box(0.84, 0.86, 0.11).at(0.01, 0, 0.66)),
+        _painted(ACCENT, *legs, *posts),
+        _painted(MAIN, *slats),
+        _painted(ACCENT, *rungs),
+        seat=0.715,
+        shelter=(0.25, 0.60),
     )
 
 
 def _table() -> Thing:
-    legs = [_p(box(0.13, 0.13, 0.80).at(x, y, 0.40), ACCENT) for x in (-0.50, 0.50) for y in (-0.80, 0.80)]
-    aprons = [_p(box(0.06, 1.55, 0.15).at(x, 0, 0.72), ACCENT) for x in (-0.50, 0.50)]
-    ends = [_p(box(0.95, 0.06, 0.15).at(0, y, 0.72), ACCENT) for y in (-0.80, 0.80)]
-    top = _p(box(1.30, 1.95, 0.10).at(z=0.84), MAIN)
-    return Thing((top, *legs, *aprons, *ends), "beige", "brown", 1.4, shelter=(0.42, 0.63))
+    legs = [box(0.13, 0.13, 0.80).at(x, y, 0.40) for x in (-0.50, 0.50) for y in (-0.80, 0.80)]
+    aprons = [box(0.06, 1.55, 0.15).at(x, 0, 0.72) for x in (-0.50, 0.50)]
+    ends = [box(0.95, 0.06, 0.15).at(0, y, 0.72) for y in (-0.80, 0.80)]
+    top = _painted(MAIN, box(1.30, 1.95, 0.10).at(z=0.84))
+    rest = _painted(ACCENT, *legs, *aprons, *ends)
+    return _thing("beige", "brown", 1.4, top, rest, shelter=(0.42, 0.63))
 
 
 def _mug() -> Thing:
-    return Thing(
-        (
-            _p(tube(0.45, 0.38, 0.98).at(z=0.50), MAIN),
-            _p(cylinder(0.44, 0.10).at(z=0.06), MAIN),
-            _p(cylinder(0.385, 0.05).at(z=0.80), "brown"),
-            _p(torus(0.415, 0.045).at(z=0.99), ACCENT),
-            _p(arc(0.27, 0.065, 112).turned("y", 90).at(0, 0.44, 0.52), MAIN),
-        ),
+    handle = arc(0.27, 0.065, 112).turned("y", 90).at(0, 0.44, 0.52)
+    return _thing(
         "blue",
         "white",
         0.45,
+        _painted(MAIN, tube(0.45, 0.38, 0.98).at(z=0.50), cylinder(0.44, 0.10).at(z=0.06), handle),
+        _painted("brown", cylinder(0.385, 0.05).at(z=0.80)),
+        _painted(ACCENT, torus(0.415, 0.045).at(z=0.99)),
         seat=1.0,
     )
 
 
 def _rocket() -> Thing:
-    fins = [_p(box(0.40, 0.06, 0.50).at(0.40, 0, 0.34).turned("z", 45 + 90 * i), ACCENT) for i in range(4)]
-    tips = [_p(capsule(0.045, 0.66).at(0.60, 0, 0.30).turned("z", 45 + 90 * i), ACCENT) for i in range(4)]
-    return Thing(
-        (
-            _p(cylinder(0.33, 1.10).at(z=0.80), MAIN),
-            _p(frustum(0.33, 0.21, 0.36).at(z=1.53), MAIN),
-            _p(cone(0.21, 0.44).at(z=1.93), ACCENT),
-            _p(cylinder(0.338, 0.07).at(z=1.34), ACCENT),
-            _p(cylinder(0.338, 0.07).at(z=0.45), ACCENT),
-            _p(frustum(0.28, 0.20, 0.20).at(z=0.16), "charcoal"),
-            _p(cone(0.19, 0.38).turned("y", 180).at(z=-0.13), "orange"),
-            _p(torus(0.115, 0.03).turned("y", 90).at(0.325, 0, 1.05), ACCENT),
-            _p(ellipsoid(0.04, 0.105, 0.105).at(0.32, 0, 1.05), "cyan"),
-            _p(torus(0.085, 0.025).turned("y", 90).at(0.327, 0, 0.70), ACCENT),
-            _p(ellipsoid(0.04, 0.08, 0.08).at(0.32, 0, 0.70), "cyan"),
-            *fins,
-            *tips,
-        ),
+    fins = [box(0.40, 0.06, 0.50).at(0.40, 0, 0.34).turned("z", 45 + 90 * i) for i in range(4)]
+    tips = [capsule(0.045, 0.66).at(0.60, 0, 0.30).turned("z", 45 + 90 * i) for i in range(4)]
+    return _thing(
         "white",
         "red",
         1.6,
+        _painted(MAIN, cylinder(0.33, 1.10).at(z=0.80), frustum(0.33, 0.21, 0.36).at(z=1.53)),
+        _painted(
+            ACCENT,
+            cone(0.21, 0.44).at(z=1.93),
+            cylinder(0.338, 0.07).at(z=1.34),
+            cylinder(0.338, 0.07).at(z=0.45),
+            torus(0.115, 0.03).turned("y", 90).at(0.325, 0, 1.05),
+            torus(0.085, 0.025).turned("y", 90).at(0.327, 0, 0.70),
+            *fins,
+            *tips,
+        ),
+        _painted("charcoal", frustum(0.28, 0.20, 0.20).at(z=0.16)),
+        _painted("orange", cone(0.19, 0.38).turned("y", 180).at(z=-0.13)),
+        _painted(
+            "cyan",
+            ellipsoid(0.04, 0.105, 0.105).at(0.32, 0, 1.05),
+            ellipsoid(0.04, 0.08, 0.08).at(0.32, 0, 0.70),
+        ),
     )
 
 
 def _house() -> Thing:
-    def window(x: float, y: float, z: float, *, sideways: bool) -> list[Part]:
-        turn = 90.0 if sideways else 0.0
-        border = box(0.05, 0.34, 0.34).turned("z", turn).at(x, y, z)
-        pane = box(0.07, 0.27, 0.27).turned("z", turn).at(x, y, z)
-        bars = [box(0.085, 0.27, 0.03), box(0.085, 0.03, 0.27)]
-        return [
-            _p(border, "white"),
-            _p(pane, "navy"),
-            *(_p(bar.turned("z", turn).at(x, y, z), "white") for bar in bars),
-        ]
+    def window(x: float, y: float, turn: float) -> tuple[Part, ...]:
+        frame, pane, *bars = (
+            solid.turned("z", turn).at(x, y, 0.45)
+            for solid in (
+                box(0.05, 0.34, 0.34),
+                box(0.07, 0.27, 0.27),
+                box(0.085, 0.27, 0.03),
+                box(0.085, 0.03, 0.27),
+            )
+        )
+        return _painted("white", frame) + _painted("navy", pane) + _painted("white", *bars)
 
-    windows = [
-        *window(0.61, -0.42, 0.45, sideways=False),
-        *window(0.61, 0.42, 0.45, sideways=False),
-        *window(-0.61, -0.36, 0.45, sideways=False),
-        *window(-0.61, 0.36, 0.45, sideways=False),
-        *window(0.0, 0.76, 0.45, sideways=True),
-        *window(0.0, -0.76, 0.45, sideways=True),
-    ]
-    return Thing(
-        (
-            _p(box(1.20, 1.50, 0.86).at(z=0.43), MAIN),
-            _p(
-                gable(1.50, 1.50, 0.62)
-                .stretched(0.8, 1.0, 1.0)
-                .turned("z", 90)
-                .stretched(1, 1.25, 1)
-                .at(z=1.16),
-                MAIN,
-            ),
-            _p(gable(1.72, 1.52, 0.68).turned("z", 90).at(z=1.20), ACCENT),
-            _p(box(0.22, 0.22, 0.62).at(-0.28, 0.45, 1.43), "maroon"),
-            _p(box(0.27, 0.27, 0.07).at(-0.28, 0.45, 1.75), "charcoal"),
-            _p(box(0.06, 0.28, 0.52).at(0.61, 0, 0.26), "brown"),
-            _p(ball(0.025).at(0.65, 0.09, 0.26), "gold"),
-            _p(box(0.26, 0.40, 0.06).at(0.68, 0, 0.03), "grey"),
-            *windows,
-        ),
+    loft = gable(1.50, 1.50, 0.62).stretched(0.8, 1.0, 1.0).turned("z", 90).stretched(1, 1.25, 1)
+    return _thing(
         "cream",
         "red",
         1.7,
+        _painted(MAIN, box(1.20, 1.50, 0.86).at(z=0.43), loft.at(z=1.16)),
+        _painted(ACCENT, gable(1.72, 1.52, 0.68).turned("z", 90).at(z=1.20)),
+        _painted("maroon", box(0.22, 0.22, 0.62).at(-0.28, 0.45, 1.43)),
+        _painted("charcoal", box(0.27, 0.27, 0.07).at(-0.28, 0.45, 1.75)),
+        _painted("brown", box(0.06, 0.28, 0.52).at(0.61, 0, 0.26)),
+        _painted("gold", ball(0.025).at(0.65, 0.09, 0.26)),
+        _painted("grey", box(0.26, 0.40, 0.06).at(0.68, 0, 0.03)),
+        *(window(x, y, 0.0) for x, y in ((0.61, -0.42), (0.61, 0.42), (-0.61, -0.36), (-0.61, 0.36))),
+        *(window(0.0, y, 90.0) for y in (0.76, -0.76)),
     )
 
 
 def _tree() -> Thing:
-    blobs = [
-        (0.0, 0.0, 1.42, 0.50),
-        (0.34, 0.16, 1.16, 0.36),
-        (-0.30, 0.30, 1.20, 0.36),
-        (-0.12, -0.40, 1.16, 0.36),
-        (0.24, -0.26, 1.30, 0.34),
+    leaves = [
+        ball(radius).at(x, y, z)
+        for x, y, z, radius in (
+            (0.0, 0.0, 1.42, 0.50),
+            (0.34, 0.16, 1.16, 0.36),
+            (-0.30, 0.30, 1.20, 0.36),
+            (-0.12, -0.40, 1.16, 0.36),
+            (0.24, -0.26, 1.30, 0.34),
+        )
     ]
-    return Thing(
-        (
-            *(_p(ball(r).at(x, y, z), MAIN) for x, y, z, r in blobs),
-            _p(frustum(0.20, 0.12, 1.05).at(z=0.52), "brown"),
-            _p(capsule(0.055, 0.60).turned("x", -40).at(0, 0.20, 0.86), "brown"),
-            _p(capsule(0.05, 0.55).turned("x", 42).at(0, -0.19, 0.84), "brown"),
-            *(_p(capsule(0.06, 0.34).turned("y", 62).at(0.17).turned("z", a).at(z=0.07), "brown")
-              for a in (20, 140, 260)),
-            *(_p(ball(0.06).at(x, y, z), ACCENT) for x, y, z in
-              ((0.66, 0.28, 1.16), (0.42, -0.05, 1.62), (0.55, -0.36, 1.34), (-0.30, 0.62, 1.30),
-               (-0.50, 0.16, 1.42), (-0.10, -0.74, 1.22), (-0.36, -0.50, 1.32))),
-        ),
+    fruits = [
+        ball(0.06).at(x, y, z)
+        for x, y, z in (
+            (0.66, 0.28, 1.16),
+            (0.42, -0.05, 1.62),
+            (0.55, -0.36, 1.34),
+            (-0.30, 0.62, 1.30),
+            (-0.50, 0.16, 1.42),
+            (-0.10, -0.74, 1.22),
+            (-0.36, -0.50, 1.32),
+        )
+    ]
+    roots = [capsule(0.06, 0.34).turned("y", 62).at(0.17).turned("z", a).at(z=0.07) for a in (20, 140, 260)]
+    return _thing(
         "green",
         "red",
         1.6,
-    )  # fmt: skip
+        _painted(MAIN, *leaves),
+        _painted(
+            "brown",
+            frustum(0.20, 0.12, 1.05).at(z=0.52),
+            capsule(0.055, 0.60).turned("x", -40).at(0, 0.20, 0.86),
+            capsule(0.05, 0.55).turned("x", 42).at(0, -0.19, 0.84),
+            *roots,
+        ),
+        _painted(ACCENT, *fruits),
+    )
 
 
 def _pine() -> Thing:
     tiers = [(0.62, 0.62, 0.62), (0.50, 0.56, 0.98), (0.38, 0.50, 1.30), (0.25, 0.42, 1.60)]
-    return Thing(
-        (
-            *(_p(cone(r, h).at(z=z), MAIN) for r, h, z in tiers),
-            _p(cylinder(0.11, 0.44).at(z=0.20), "brown"),
-            _p(star(0.14, 0.06, 0.05).at(z=1.90), ACCENT),
-        ),
+    return _thing(
         "green",
         "yellow",
         1.6,
+        _painted(MAIN, *(cone(radius, height).at(z=z) for radius, height, z in tiers)),
+        _painted("brown", cylinder(0.11, 0.44).at(z=0.20)),
+        _painted(ACCENT, star(0.14, 0.06, 0.05).at(z=1.90)),
     )
 
 
 def _hammer() -> Thing:
-    return Thing(
-        (
-            _p(capsule(0.075, 1.50).at(z=0.75), ACCENT),
-            _p(cylinder(0.09, 0.42).at(z=0.22), "charcoal"),
-            _p(box(0.24, 0.44, 0.26).at(z=1.42), MAIN),
-            _p(cylinder(0.10, 0.24).turned("x", 90).at(0, -0.30, 1.42), MAIN),
-            _p(cylinder(0.145, 0.14).turned("x", 90).at(0, -0.44, 1.42), MAIN),
-            _p(pyramid(0.20, 0.22, 0.46).turned("x", -90).at(0, 0.44, 1.42), MAIN),
-        ),
+    return _thing(
         "grey",
         "brown",
         0.8,
+        _painted(ACCENT, capsule(0.075, 1.50).at(z=0.75)),
+        _painted("charcoal", cylinder(0.09, 0.42).at(z=0.22)),
+        _painted(
+            MAIN,
+            box(0.24, 0.44, 0.26).at(z=1.42),
+            cylinder(0.10, 0.24).turned("x", 90).at(0, -0.30, 1.42),
+            cylinder(0.145, 0.14).turned("x", 90).at(0, -0.44, 1.42),
+            pyramid(0.20, 0.22, 0.46).turned("x", -90).at(0, 0.44, 1.42),
+        ),
     )
 
 
 def _mushroom() -> Thing:
     # The cap is a ball, stretched and shifted, sitting over a flat disc of gills.
-    return Thing(
-        (
-            _p(frustum(0.21, 0.16, 0.82).at(z=0.38), ACCENT),
-            _p(ellipsoid(0.27, 0.27, 0.13).at(z=0.06), ACCENT),
-            _p(frustum(0.20, 0.54, 0.10).at(z=0.72), "beige"),
-            _p(ellipsoid(0.60, 0.60, 0.09).at(z=0.82), MAIN),
-            _p(ellipsoid(0.56, 0.56, 0.42).at(z=0.86), MAIN),
-            _p(frustum(0.30, 0.17, 0.10).at(z=0.60), "white"),
-        ),
+    return _thing(
         "red",
         "cream",
         0.7,
+        _painted(ACCENT, frustum(0.21, 0.16, 0.82).at(z=0.38), ellipsoid(0.27, 0.27, 0.13).at(z=0.06)),
+        _painted("beige", frustum(0.20, 0.54, 0.10).at(z=0.72)),
+        _painted(MAIN, ellipsoid(0.60, 0.60, 0.09).at(z=0.82), ellipsoid(0.56, 0.56, 0.42).at(z=0.86)),
+        _painted("white", frustum(0.30, 0.17, 0.10).at(z=0.60)),
     )
 
 
 def _car() -> Thing:
-    wheels = []
-    for x in (-0.55, 0.55):
-        for side in (-1, 1):
-            wheels += [
-                _p(cylinder(0.20, 0.16).turned("x", 90).at(x, 0.40 * side, 0.20), "black"),
-                _p(cylinder(0.10, 0.18).turned("x", 90).at(x, 0.40 * side, 0.20), "silver"),
-            ]
-    return Thing(
-        (
-            _p(box(1.80, 0.84, 0.34).at(z=0.38), MAIN),
-            _p(frustum(0.62, 0.42, 0.44).stretched(y=0.66).at(-0.10, 0, 0.74), "navy"),
-            _p(cylinder(0.44, 0.07).stretched(y=0.68).at(-0.10, 0, 0.96), ACCENT),
-            *wheels,
-            *(_p(ellipsoid(0.05, 0.09, 0.07).at(0.90, y, 0.44), "yellow") for y in (-0.28, 0.28)),
-            *(_p(box(0.05, 0.16, 0.09).at(-0.90, y, 0.44), "maroon") for y in (-0.28, 0.28)),
-            _p(box(0.06, 0.34, 0.10).at(0.89, 0, 0.36), "charcoal"),
-            *(_p(box(0.08, 0.88, 0.09).at(x, 0, 0.26), "silver") for x in (-0.89, 0.89)),
-        ),
+    wheels = [
+        _painted(colour, cylinder(radius, width).turned("x", 90).at(x, 0.40 * side, 0.20))
+        for x in (-0.55, 0.55)
+        for side in (-1, 1)
+        for colour, radius, width in (("black", 0.20, 0.16), ("silver", 0.10, 0.18))
+    ]
+    return _thing(
         "red",
         "white",
         1.2,
+        _painted(MAIN, box(1.80, 0.84, 0.34).at(z=0.38)),
+        _painted("navy", frustum(0.62, 0.42, 0.44).stretched(y=0.66).at(-0.10, 0, 0.74)),
+        _painted(ACCENT, cylinder(0.44, 0.07).stretched(y=0.68).at(-0.10, 0, 0.96)),
+        *wheels,
+        _painted("yellow", *(ellipsoid(0.05, 0.09, 0.07).at(0.90, y, 0.44) for y in (-0.28, 0.28))),
+        _painted("maroon", *(box(0.05, 0.16, 0.09).at(-0.90, y, 0.44) for y in (-0.28, 0.28))),
+        _painted("charcoal", box(0.06, 0.34, 0.10).at(0.89, 0, 0.36)),
+        _painted("silver", *(box(0.08, 0.88, 0.09).at(x, 0, 0.26) for x in (-0.89, 0.89))),
     )
 
 
@@ -386,66 +392,69 @@ def _robot() -> Thing:
     limbs = []
     for side in (-1, 1):
         limbs += [
-            _p(cylinder(0.10, 0.30).turned("x", 90).at(0, 0.40 * side, 1.02), "charcoal"),
-            _p(box(0.18, 0.16, 0.52).at(0, 0.52 * side, 0.84), MAIN),
-            _p(ball(0.12).at(0, 0.52 * side, 0.52), ACCENT),
-            _p(box(0.20, 0.20, 0.46).at(0, 0.19 * side, 0.26), MAIN),
-            _p(box(0.36, 0.25, 0.12).at(0.05, 0.19 * side, 0.06), "charcoal"),
-            _p(cylinder(0.075, 0.06).turned("y", 90).at(0.24, 0.13 * side, 1.46), "yellow"),
-            _p(cylinder(0.06, 0.08).turned("x", 90).at(0, 0.33 * side, 1.42), "charcoal"),
+            _painted(
+                MAIN,
+                box(0.18, 0.16, 0.52).at(0, 0.52 * side, 0.84),
+                box(0.20, 0.20, 0.46).at(0, 0.19 * side, 0.26),
+            ),
+            _painted(
+                "charcoal",
+                cylinder(0.10, 0.30).turned("x", 90).at(0, 0.40 * side, 1.02),
+                box(0.36, 0.25, 0.12).at(0.05, 0.19 * side, 0.06),
+            ),
+            _painted(ACCENT, ball(0.12).at(0, 0.52 * side, 0.52)),
+            _painted("yellow", cylinder(0.075, 0.06).turned("y", 90).at(0.24, 0.13 * side, 1.46)),
+            _painted("charcoal", cylinder(0.06, 0.08).turned("x", 90).at(0, 0.33 * side, 1.42)),
         ]
-    return Thing(
-        (
-            _p(box(0.46, 0.70, 0.66).at(z=0.80), MAIN),
-            _p(cylinder(0.10, 0.14).at(z=1.16), "charcoal"),
-            _p(box(0.46, 0.58, 0.46).at(z=1.42), MAIN),
-            _p(box(0.04, 0.40, 0.32).at(0.23, 0, 0.86), ACCENT),
-            _p(ball(0.05).at(0.25, -0.11, 0.92), "red"),
-            _p(ball(0.05).at(0.25, 0.0, 0.92), "yellow"),
-            _p(ball(0.05).at(0.25, 0.11, 0.92), "green"),
-            _p(box(0.05, 0.32, 0.07).at(0.225, 0, 1.30), "charcoal"),
-            _p(cylinder(0.02, 0.22).at(z=1.74), "charcoal"),
-            _p(ball(0.06).at(z=1.87), ACCENT),
-            *limbs,
-        ),
+    buttons = zip(("red", "yellow", "green"), (-0.11, 0.0, 0.11), strict=True)
+    return _thing(
         "silver",
         "red",
         1.2,
+        _painted(MAIN, box(0.46, 0.70, 0.66).at(z=0.80), box(0.46, 0.58, 0.46).at(z=1.42)),
+        _painted(ACCENT, box(0.04, 0.40, 0.32).at(0.23, 0, 0.86)),
+        *(_painted(colour, ball(0.05).at(0.25, y, 0.92)) for colour, y in buttons),
+        _painted(
+            "charcoal",
+            cylinder(0.10, 0.14).at(z=1.16),
+            box(0.05, 0.32, 0.07).at(0.225, 0, 1.30),
+            cylinder(0.02, 0.22).at(z=1.74),
+        ),
+        _painted(ACCENT, ball(0.06).at(z=1.87)),
+        *limbs,
     )
 
 
 def _lamp() -> Thing:
-    return Thing(
-        (
-            _p(cylinder(0.36, 0.08).at(z=0.04), ACCENT),
-            _p(ellipsoid(0.20, 0.20, 0.30).at(z=0.34), ACCENT),
-            _p(cylinder(0.045, 0.60).at(z=0.80), "gold"),
-            _p(frustum(0.58, 0.34, 0.60).at(z=1.28), MAIN),
-            _p(torus(0.575, 0.025).at(z=0.99), "white"),
-            _p(torus(0.345, 0.025).at(z=1.57), "white"),
-            _p(ball(0.06).at(z=1.64), "gold"),
-        ),
+    return _thing(
         "yellow",
         "blue",
         0.9,
+        _painted(ACCENT, cylinder(0.36, 0.08).at(z=0.04), ellipsoid(0.20, 0.20, 0.30).at(z=0.34)),
+        _painted("gold", cylinder(0.045, 0.60).at(z=0.80), ball(0.06).at(z=1.64)),
+        _painted(MAIN, frustum(0.58, 0.34, 0.60).at(z=1.28)),
+        _painted("white", torus(0.575, 0.025).at(z=0.99), torus(0.345, 0.025).at(z=1.57)),
     )
 
 
 def _boat() -> Thing:
-    return Thing(
-        (
-            _p(box(1.10, 0.62, 0.34).at(-0.15, 0, 0.27), MAIN),
-            _p(pyramid(0.34, 0.62, 0.62).turned("y", 90).at(0.70, 0, 0.27), MAIN),
-            _p(box(1.14, 0.66, 0.06).at(-0.15, 0, 0.46), ACCENT),
-            _p(cylinder(0.045, 1.70).at(0.10, 0, 1.15), "brown"),
-            _p(pyramid(1.00, 0.05, 1.25).at(-0.10, 0, 1.28), ACCENT),
-            _p(pyramid(0.62, 0.04, 0.95).at(0.42, 0, 1.10), ACCENT),
-            _p(box(0.36, 0.34, 0.20).at(-0.42, 0, 0.56), "brown"),
-            _p(box(0.26, 0.03, 0.14).at(-0.03, 0, 1.93), "red"),
-        ),
+    return _thing(
         "blue",
         "white",
         1.3,
+        _painted(
+            MAIN,
+            box(1.10, 0.62, 0.34).at(-0.15, 0, 0.27),
+            pyramid(0.34, 0.62, 0.62).turned("y", 90).at(0.70, 0, 0.27),
+        ),
+        _painted(
+            ACCENT,
+            box(1.14, 0.66, 0.06).at(-0.15, 0, 0.46),
+            pyramid(1.00, 0.05, 1.25).at(-0.10, 0, 1.28),
+            pyramid(0.62, 0.04, 0.95).at(0.42, 0, 1.10),
+        ),
+        _painted("brown", cylinder(0.045, 1.70).at(0.10, 0, 1.15), box(0.36, 0.34, 0.20).at(-0.42, 0, 0.56)),
+        _painted("red", box(0.26, 0.03, 0.14).at(-0.03, 0, 1.93)),
     )
 
 
@@ -454,30 +463,27 @@ def _castle() -> Thing:
     for x in (-0.60, 0.60):
         for y in (-0.60, 0.60):
             towers += [
-                _p(cylinder(0.22, 1.05).at(x, y, 0.52), MAIN),
-                _p(cylinder(0.26, 0.10).at(x, y, 1.06), "grey"),
-                _p(cone(0.29, 0.46).at(x, y, 1.33), ACCENT),
-                _p(box(0.06, 0.07, 0.16).at(x + (0.20 if x > 0 else -0.20), y, 0.74), "charcoal"),
+                _painted(MAIN, cylinder(0.22, 1.05).at(x, y, 0.52)),
+                _painted("grey", cylinder(0.26, 0.10).at(x, y, 1.06)),
+                _painted(ACCENT, cone(0.29, 0.46).at(x, y, 1.33)),
+                _painted("charcoal", box(0.06, 0.07, 0.16).at(x + (0.20 if x > 0 else -0.20), y, 0.74)),
             ]
-    merlons = [
-        _p(box(0.12, 0.13, 0.13).at(x, y, 0.74), MAIN)
-        for x, y in (*((a, b) for a in (-0.60, 0.60) for b in (-0.26, 0.0, 0.26)),
-                     *((b, a) for a in (-0.60, 0.60) for b in (-0.26, 0.0, 0.26)))
-    ]  # fmt: skip
-    return Thing(
-        (
-            _p(box(1.30, 1.30, 0.68).at(z=0.34), MAIN),
-            _p(box(0.56, 0.56, 1.00).at(z=0.90), MAIN),
-            _p(pyramid(0.70, 0.70, 0.56).at(z=1.67), ACCENT),
-            _p(box(0.06, 0.34, 0.34).at(0.64, 0, 0.17), "brown"),
-            _p(cylinder(0.17, 0.06).turned("y", 90).at(0.64, 0, 0.34), "brown"),
-            *(_p(box(0.06, 0.10, 0.18).at(x, 0, 1.14), "charcoal") for x in (-0.27, 0.27)),
-            *merlons,
-            *towers,
-        ),
+    edges = [(a, b) for a in (-0.60, 0.60) for b in (-0.26, 0.0, 0.26)]
+    merlons = [box(0.12, 0.13, 0.13).at(x, y, 0.74) for x, y in (*edges, *((b, a) for a, b in edges))]
+    return _thing(
         "beige",
         "blue",
         1.8,
+        _painted(MAIN, box(1.30, 1.30, 0.68).at(z=0.34), box(0.56, 0.56, 1.00).at(z=0.90)),
+        _painted(ACCENT, pyramid(0.70, 0.70, 0.56).at(z=1.67)),
+        _painted(
+            "brown",
+            box(0.06, 0.34, 0.34).at(0.64, 0, 0.17),
+            cylinder(0.17, 0.06).turned("y", 90).at(0.64, 0, 0.34),
+        ),
+        _painted("charcoal", *(box(0.06, 0.10, 0.18).at(x, 0, 1.14) for x in (-0.27, 0.27))),
+        _painted(MAIN, *merlons),
+        *towers,
     )
 
 
@@ -485,143 +491,127 @@ def _cactus() -> Thing:
     arms = []
     for side, z in ((-1, 0.72), (1, 0.94)):
         arms += [
-            _p(capsule(0.10, 0.44).turned("x", 90).at(0, 0.30 * side, z), MAIN),
-            _p(capsule(0.10, 0.52).at(0, 0.46 * side, z + 0.18), MAIN),
+            capsule(0.10, 0.44).turned("x", 90).at(0, 0.30 * side, z),
+            capsule(0.10, 0.52).at(0, 0.46 * side, z + 0.18),
         ]
-    return Thing(
-        (
-            _p(capsule(0.20, 1.30).at(z=0.92), MAIN),
-            *arms,
-            _p(ellipsoid(0.08, 0.08, 0.05).at(z=1.57), "pink"),
-            _p(frustum(0.26, 0.36, 0.40).at(z=0.20), ACCENT),
-            _p(tube(0.41, 0.30, 0.10).at(z=0.40), ACCENT),
-            _p(cylinder(0.33, 0.02).at(z=0.41), "brown"),
-        ),
+    return _thing(
         "green",
         "orange",
         0.8,
+        _painted(MAIN, capsule(0.20, 1.30).at(z=0.92), *arms),
+        _painted("pink", ellipsoid(0.08, 0.08, 0.05).at(z=1.57)),
+        _painted(ACCENT, frustum(0.26, 0.36, 0.40).at(z=0.20), tube(0.41, 0.30, 0.10).at(z=0.40)),
+        _painted("brown", cylinder(0.33, 0.02).at(z=0.41)),
     )
 
 
 def _flower() -> Thing:
     petals = [
-        _p(ellipsoid(0.06, 0.17, 0.24).at(0, 0, 0.33).turned("x", 45.0 * i).at(0.02, 0, 1.30), MAIN)
-        for i in range(8)
+        ellipsoid(0.06, 0.17, 0.24).at(0, 0, 0.33).turned("x", 45.0 * i).at(0.02, 0, 1.30) for i in range(8)
     ]
-    return Thing(
-        (
-            *petals,
-            _p(ellipsoid(0.13, 0.20, 0.20).at(0.03, 0, 1.30), ACCENT),
-            _p(cylinder(0.04, 1.25).at(-0.03, 0, 0.66), "green"),
-            _p(ellipsoid(0.05, 0.30, 0.12).turned("x", 35).at(-0.03, 0.27, 0.52), "green"),
-            _p(ellipsoid(0.05, 0.30, 0.12).turned("x", -35).at(-0.03, -0.27, 0.40), "green"),
-            _p(ellipsoid(0.30, 0.30, 0.10).at(-0.03, 0, 0.05), "brown"),
-        ),
+    return _thing(
         "pink",
         "yellow",
         0.7,
+        _painted(MAIN, *petals),
+        _painted(ACCENT, ellipsoid(0.13, 0.20, 0.20).at(0.03, 0, 1.30)),
+        _painted(
+            "green",
+            cylinder(0.04, 1.25).at(-0.03, 0, 0.66),
+            ellipsoid(0.05, 0.30, 0.12).turned("x", 35).at(-0.03, 0.27, 0.52),
+            ellipsoid(0.05, 0.30, 0.12).turned("x", -35).at(-0.03, -0.27, 0.40),
+        ),
+        _painted("brown", ellipsoid(0.30, 0.30, 0.10).at(-0.03, 0, 0.05)),
     )
 
 
 def _windmill() -> Thing:
-    blades = []
-    for i in range(4):
-        turn = 45.0 + 90.0 * i
-        blades += [
-            _p(box(0.04, 0.05, 0.95).at(0.47, 0, 0.48).turned("x", turn).at(0, 0, 1.30), "brown"),
-            _p(box(0.03, 0.20, 0.66).at(0.47, 0.12, 0.60).turned("x", turn).at(0, 0, 1.30), ACCENT),
-        ]
-    return Thing(
-        (
-            _p(frustum(0.46, 0.30, 1.25).at(z=0.62), MAIN),
-            _p(cone(0.38, 0.42).at(z=1.46), "brown"),
-            _p(cylinder(0.06, 0.34).turned("y", 90).at(0.36, 0, 1.30), "charcoal"),
-            _p(ball(0.08).at(0.52, 0, 1.30), "charcoal"),
-            _p(box(0.10, 0.20, 0.36).at(0.42, 0, 0.20), "brown"),
-            _p(box(0.08, 0.14, 0.16).at(0.36, 0, 0.78), "navy"),
-            *(_p(box(0.10, 0.14, 0.16).at(0.385, 0, 0.70).turned("z", a), "navy") for a in (90, 180, 270)),
-            *blades,
-        ),
+    blades = [
+        _painted(colour, blade.turned("x", 45.0 + 90.0 * i).at(0, 0, 1.30))
+        for i in range(4)
+        for colour, blade in (
+            ("brown", box(0.04, 0.05, 0.95).at(0.47, 0, 0.48)),
+            (ACCENT, box(0.03, 0.20, 0.66).at(0.47, 0.12, 0.60)),
+        )
+    ]
+    windows = [box(0.10, 0.14, 0.16).at(0.385, 0, 0.70).turned("z", a) for a in (90, 180, 270)]
+    return _thing(
         "cream",
         "red",
         1.7,
+        _painted(MAIN, frustum(0.46, 0.30, 1.25).at(z=0.62)),
+        _painted("brown", cone(0.38, 0.42).at(z=1.46), box(0.10, 0.20, 0.36).at(0.42, 0, 0.20)),
+        _painted(
+            "charcoal", cylinder(0.06, 0.34).turned("y", 90).at(0.36, 0, 1.30), ball(0.08).at(0.52, 0, 1.30)
+        ),
+        _painted("navy", box(0.08, 0.14, 0.16).at(0.36, 0, 0.78), *windows),
+        *blades,
     )
 
 
 def _cake() -> Thing:
-    cherries = [_p(ball(0.075).at(0.44).turned("z", 45.0 * i).at(z=0.56), ACCENT) for i in range(8)]
-    candles = [
-        part
-        for i in range(3)
-        for part in (
-            _p(cylinder(0.035, 0.26).at(0.15).turned("z", 120.0 * i).at(z=0.95), "cyan"),
-            _p(ellipsoid(0.035, 0.035, 0.06).at(0.15).turned("z", 120.0 * i).at(z=1.13), "yellow"),
-        )
-    ]
-    return Thing(
-        (
-            _p(cylinder(0.78, 0.05).at(z=0.025), "silver"),
-            _p(cylinder(0.60, 0.46).at(z=0.28), MAIN),
-            _p(torus(0.585, 0.05).at(z=0.09), "white"),
-            _p(torus(0.565, 0.05).at(z=0.50), "white"),
-            _p(cylinder(0.34, 0.34).at(z=0.67), MAIN),
-            _p(torus(0.315, 0.04).at(z=0.83), "white"),
-            _p(torus(0.33, 0.04).at(z=0.54), "white"),
-            *cherries,
-            *candles,
-        ),
+    cherries = [ball(0.075).at(0.44).turned("z", 45.0 * i).at(z=0.56) for i in range(8)]
+    candles = [cylinder(0.035, 0.26).at(0.15).turned("z", 120.0 * i).at(z=0.95) for i in range(3)]
+    flames = [ellipsoid(0.035, 0.035, 0.06).at(0.15).turned("z", 120.0 * i).at(z=1.13) for i in range(3)]
+    icing = ((0.585, 0.05, 0.09), (0.565, 0.05, 0.50), (0.315, 0.04, 0.83), (0.33, 0.04, 0.54))
+    return _thing(
         "pink",
         "red",
         0.8,
+        _painted("silver", cylinder(0.78, 0.05).at(z=0.025)),
+        _painted(MAIN, cylinder(0.60, 0.46).at(z=0.28), cylinder(0.34, 0.34).at(z=0.67)),
+        _painted("white", *(torus(ring, pipe).at(z=z) for ring, pipe, z in icing)),
+        _painted(ACCENT, *cherries),
+        _painted("cyan", *candles),
+        _painted("yellow", *flames),
     )
 
 
 def _icecream() -> Thing:
-    return Thing(
-        (
-            _p(cone(0.36, 1.10).turned("x", 180).at(z=0.55), "beige", "brown", "checkered"),
-            _p(ball(0.38).at(z=1.22), MAIN),
-            _p(torus(0.35, 0.07).at(z=1.10), MAIN),
-            _p(ball(0.29).at(z=1.68), ACCENT),
-            _p(ball(0.09).at(z=2.00), "red"),
-        ),
+    waffle = cone(0.36, 1.10).turned("x", 180).at(z=0.55)
+    return _thing(
         "pink",
         "cream",
         0.7,
+        (Part(waffle, Coat("beige", "brown", "checkered")),),
+        _painted(MAIN, ball(0.38).at(z=1.22), torus(0.35, 0.07).at(z=1.10)),
+        _painted(ACCENT, ball(0.29).at(z=1.68)),
+        _painted("red", ball(0.09).at(z=2.00)),
     )
 
 
 def _candle() -> Thing:
-    return Thing(
-        (
-            _p(cylinder(0.26, 1.00).at(z=0.62), MAIN),
-            _p(capsule(0.06, 0.36).at(0.24, 0.06, 0.98), MAIN),
-            _p(capsule(0.05, 0.50).at(-0.16, 0.19, 0.90), MAIN),
-            _p(capsule(0.05, 0.30).at(0.02, -0.255, 1.00), MAIN),
-            _p(torus(0.235, 0.04).at(z=1.12), MAIN),
-            _p(cylinder(0.02, 0.16).at(z=1.18), "black"),
-            _p(ellipsoid(0.10, 0.10, 0.16).at(z=1.36), "orange"),
-            _p(cone(0.082, 0.22).at(z=1.52), "orange"),
-            _p(frustum(0.40, 0.54, 0.12).at(z=0.08), ACCENT),
-            _p(torus(0.50, 0.04).at(z=0.14), ACCENT),
-            _p(torus(0.13, 0.035).turned("x", 90).at(0.64, 0, 0.12), ACCENT),
-        ),
+    return _thing(
         "cream",
         "gold",
         0.5,
+        _painted(
+            MAIN,
+            cylinder(0.26, 1.00).at(z=0.62),
+            capsule(0.06, 0.36).at(0.24, 0.06, 0.98),
+            capsule(0.05, 0.50).at(-0.16, 0.19, 0.90),
+            capsule(0.05, 0.30).at(0.02, -0.255, 1.00),
+            torus(0.235, 0.04).at(z=1.12),
+        ),
+        _painted("black", cylinder(0.02, 0.16).at(z=1.18)),
+        _painted("orange", ellipsoid(0.10, 0.10, 0.16).at(z=1.36), cone(0.082, 0.22).at(z=1.52)),
+        _painted(
+            ACCENT,
+            frustum(0.40, 0.54, 0.12).at(z=0.08),
+            torus(0.50, 0.04).at(z=0.14),
+            torus(0.13, 0.035).turned("x", 90).at(0.64, 0, 0.12),
+        ),
     )
 
 
 def _planet() -> Thing:
-    return Thing(
-        (
-            _p(ball(0.55), MAIN, ACCENT, "striped"),
-            _p(tube(0.92, 0.70, 0.03).turned("x", 22), "beige"),
-            _p(tube(1.05, 0.96, 0.03).turned("x", 22), "brown"),
-        ),
+    return _thing(
         "orange",
         "cream",
         1.2,
+        (Part(ball(0.55), Coat(MAIN, ACCENT, "striped")),),
+        _painted("beige", tube(0.92, 0.70, 0.03).turned("x", 22)),
+        _painted("brown", tube(1.05, 0.96, 0.03).turned("x", 22)),
     )
 
 
@@ -631,9 +621,9 @@ def _donut() -> Thing:
     for i in range(20):
         turn, tilt = 18.0 * i, (-34.0, 8.0, 38.0)[i % 3]
         seed = capsule(0.028, 0.13).turned("y", 90).turned("z", 47.0 * i).at(z=0.335).turned("y", tilt)
-        sprinkles.append(_p(seed.at(0.62).turned("z", turn).at(z=0.05), colours[i % 5]))
-    return Thing((_p(torus(0.62, 0.33), "beige"), _p(torus(0.62, 0.325).at(z=0.05), MAIN), *sprinkles),
-                 "pink", "white", 0.6)  # fmt: skip
+        sprinkles.append(_painted(colours[i % 5], seed.at(0.62).turned("z", turn).at(z=0.05)))
+    dough, icing = torus(0.62, 0.33), torus(0.62, 0.325).at(z=0.05)
+    return _thing("pink", "white", 0.6, _painted("beige", dough), _painted(MAIN, icing), *sprinkles)
 
 
 PRIMITIVES: dict[str, Solid] = {
@@ -713,4 +703,4 @@ ALIASES: dict[str, str] = {
     "stool": "chair",
     "desk": "table",
     "doughnut": "donut",
-}  # fmt: skip
+}
