@@ -9,7 +9,7 @@ from cadam3d.build import build_trainer, component
 from cadam3d.commands.beginning import run_context
 from cadam3d.core.cameras import turntable
 from cadam3d.initializer.base import Initializer
-from cadam3d.prior.shapes.vocabulary import COLOURS
+from cadam3d.prior.shapes.words import COLOURS
 from cadam3d.settings.compose import compose
 
 pytest.importorskip("diffusers")

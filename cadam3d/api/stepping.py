@@ -92,7 +92,7 @@ class Stepper:
         with logging_messages(), usual_modes(), deterministic(self.device):
             backend = self.parts.rasterizer.prepare(self.device)
             state = self.parts.start(self.prompt, self.initializer, seed, self.device)
-            load_prior(self.parts, self._embedding, state, backend)
+            load_prior(self.parts, state, backend)
         return state
 
     def step(self, state: TrainState) -> Step:

@@ -14,7 +14,6 @@ from cadam3d.commands.messages import note, note_backend
 from cadam3d.io.atomic import remove_leftovers, replacing
 from cadam3d.io.lock import INHERITED
 from cadam3d.io.run_folder import CONFIG, HYDRA_CONFIG, HYDRA_SETTINGS, LOG, OVERRIDES
-from cadam3d.prior.base import PromptEmbedding
 from cadam3d.rasterizer.base import Backend
 from cadam3d.settings.compose import Call
 from cadam3d.state import RunContext, TrainState
@@ -41,13 +40,13 @@ def deterministic(device: torch.device) -> Iterator[None]:
         torch.set_deterministic_debug_mode(before)
 
 
-def load_prior(trainer: Trainer, embedding: PromptEmbedding, state: TrainState, backend: Backend) -> None:
-    """Load the prior, and print what the user must know about it, the prompt, the start and the rasterizer.
+def load_prior(trainer: Trainer, state: TrainState, backend: Backend) -> None:
+    """Load the prior, and print what the user must know about it, the start and the rasterizer.
 
     The prior is loaded last, because an initializer may have needed the memory and has freed it now.
     """
     trainer.prior.load()
-    for text in filter(None, (trainer.prior.notice(), embedding.notice(), state.initial_note)):
+    for text in filter(None, (trainer.prior.notice(), state.initial_note)):
         note(text)
     note_backend(backend)
 

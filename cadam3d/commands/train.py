@@ -61,7 +61,7 @@ def optimise(
         embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
         state = start_or_resume(cfg, trainer, initializer, device, folder)
         start = keep_start(cfg, state, initializer, device) if results.measures_start else None
-        load_prior(trainer, embedding, state, backend)
+        load_prior(trainer, state, backend)
         timetable = describe(trainer)
         say(f"Schedule: {timetable}")
 

@@ -146,11 +146,7 @@ class Pretrained:
         torch.set_default_dtype(dtype)
         try:
             with torch.device("meta"):
-                network = (
-                    kind.from_config(config)
-                    if hasattr(kind, "from_config")
-                    else kind(kind.config_class.from_dict(config))
-                )
+                network = empty(kind, config)
         finally:
             torch.set_default_dtype(usual)
         return network.requires_grad_(False).eval()
@@ -200,6 +196,13 @@ class Pretrained:
     def _unusable(self, problem: str) -> UserError:
         """Return the error about a part that cannot be used."""
         return UserError(f"{self.source.key}: {problem}. Try: {self.source.key}.path=DIR")
+
+
+def empty(kind: Any, config: Mapping[str, Any]) -> Any:
+    """Return a network of a class of diffusers or transformers, before its weights are loaded."""
+    if hasattr(kind, "from_config"):
+        return kind.from_config(config)
+    return kind(kind.config_class.from_dict(config))
 
 
 def require_extra(key: str) -> None:

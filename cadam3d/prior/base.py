@@ -30,10 +30,6 @@ class PromptEmbedding(ABC):
     def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> Condition:
         """Return the condition of these views over these background colours, RGB in [0, 1]."""
 
-    def notice(self) -> str | None:
-        """Return a sentence about the prompt that the user must read before training, or None."""
-        return None
-
 
 @dataclass(frozen=True)
 class MemoryEstimate:

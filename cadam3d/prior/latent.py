@@ -19,7 +19,7 @@ from torch.nn import functional as F  # noqa: N812  (the usual name)
 from torch.utils.checkpoint import checkpoint
 
 from cadam3d.core.cameras import Cameras, orbit
-from cadam3d.core.checks import require, require_choice, require_whole
+from cadam3d.core.checks import require, require_choice, require_whole, unless_none
 from cadam3d.core.errors import UserError
 from cadam3d.io.cache import default_cache_dir
 from cadam3d.io.pretrained import DTYPES, VOCABULARY, ModelSource, Pretrained
@@ -68,11 +68,6 @@ class LatentEmbedding(PromptEmbedding):
 
     texts: Texts
     prompting: Prompting
-    hints: Sequence[str]  # sentences about the prompt and the size of the images
-
-    def notice(self) -> str | None:
-        """Return what the user should know about the prompt and the size of the images, or None."""
-        return " ".join(self.hints) or None
 
     def at(self, cameras: Cameras, background: Float[Tensor, "v 3"]) -> TextCondition:
         """Return the condition of these views; the background is not used."""
@@ -118,31 +113,14 @@ class LatentPrior(DiffusionPrior):
 
     def __post_init__(self) -> None:
         self.source  # noqa: B018  (checks path, ids, revision and variant)
-        require(
-            isinstance(self.prompting, Prompting),
-            "prior.prompting",
-            expected="one of the prompting options",
-            got=self.prompting,
-            example="'prior.prompting=${prompting}'",
-        )
         if self.size is not None:
-            # Every model accepts 64 pixels, and the next smaller size if it accepts this one.
             unit = 2 * FACTOR
-            require_whole("prior.size", self.size, low=unit)
-            require(
-                self.size % unit == 0,
-                "prior.size",
-                expected=f"a multiple of {unit}",
-                got=self.size,
-                example=f"prior.size={self.size // unit * unit}",
-            )
+            is_possible = self.size > 0 and self.size % unit == 0
+            require(is_possible, "prior.size", expected=f"a multiple of {unit}", got=self.size)
         require_choice("prior.noise_levels", self.noise_levels, LEVELS)
         require_choice("prior.dtype", self.dtype, ("auto", *DTYPES))
-        if self.micro_batch is not None:
-            require_whole("prior.micro_batch", self.micro_batch, low=1)
+        unless_none(require_whole, "prior.micro_batch", self.micro_batch, low=1)
         require_choice("prior.text_device", self.text_device, ("auto", "cpu"))
-        require_choice("prior.tiling", self.tiling, (False, True))
-        require_choice("prior.compile", self.compile, (False, True))
 
     # --- methods that a family of models implements ---------------------------------------------------------
 
@@ -181,10 +159,7 @@ class LatentPrior(DiffusionPrior):
         """
         self._require_readable(prompt, negative)
         texts = self._cache.embedded(self._listed(prompt, negative), self._embed)
-        hints = [self._size_hint(), self.lexicon.hint(prompt) if self.lexicon is not None else None]
-        return LatentEmbedding(
-            texts=texts.to(self.device), prompting=self.prompting, hints=[hint for hint in hints if hint]
-        )
+        return LatentEmbedding(texts=texts.to(self.device), prompting=self.prompting)
 
     def encode(self, rgb: Float[Tensor, "v h w 3"]) -> Float[Tensor, "v c lh lw"]:
         """Convert images in [0, 1] to scaled latents; differentiable."""
@@ -227,13 +202,7 @@ class LatentPrior(DiffusionPrior):
         guess = outputs[0]
         if len(branches) == 1:
             return self.complete(noisy, guess.to(noisy.dtype), t)
-        guess = guide(
-            outputs[0],
-            outputs[1],
-            torch.stack([*outputs[2:]]) if repelled else guess[None][:0],
-            mix.strengths,
-            scale,
-        )
+        guess = guide(outputs[0], outputs[1], outputs[2:], mix.strengths, scale)
         guided = self.complete(noisy, guess.to(noisy.dtype), t)
         return self.tempered(noisy, guided, outputs[1].to(noisy.dtype), t)
 
@@ -369,23 +338,13 @@ class LatentPrior(DiffusionPrior):
             if self.lexicon is not None:
                 self.lexicon.require_known(key, text)
 
-    def _size_hint(self) -> str | None:
-        """Return a warning if the images are larger than those in training, or less than half as large."""
-        size, trained = self.size, self.trained_size
-        if size is None or trained is None or trained / 2 <= size <= trained:
-            return None
-        return (
-            f"The model was trained with images of {trained} pixels per side, but prior.size is {size}. "
-            f"prior.size={trained} usually looks better."
-        )
-
     def _require_size(self, key: str, size: int) -> None:
         """Raise ``UserError`` if images of ``size`` pixels per side are too large for the network."""
         trained = self.trained_size
         require(
             trained is None or size <= LARGEST * trained,
             key,
-            expected=f"at most {LARGEST * (trained or 0)} pixels, since the model was trained with {trained}",
+            expected=f"at most {LARGEST} times the {trained} pixels of the training",
             got=size,
             example=f"{key}={trained}",
         )
@@ -395,12 +354,10 @@ class LatentPrior(DiffusionPrior):
         if self.size is None:
             self._require_size("camera.size", max(size))
         require(
-            all(side % FACTOR == 0 and side >= FACTOR for side in size),
+            all(side % FACTOR == 0 for side in size),
             "camera.size",
             expected=f"a multiple of {FACTOR} pixels, since prior.size is null",
             got=size[0],
-            # Never more than the network accepts, and never 0.
-            example=f"camera.size={max(FACTOR, size[0] // FACTOR * FACTOR)}",
         )
         if tuple(images.shape[2:]) == tuple(size):
             return images
@@ -454,10 +411,11 @@ class LatentPrior(DiffusionPrior):
             return working_bytes(lambda: ghost.denoise(noisy, timestep, texts, cameras), network.parameters())
 
     def _embed(self, texts: Sequence[str]) -> Texts:
-        made = self.embed_texts(
-            self.found, texts, torch.device("cpu") if self.text_device == "cpu" else self.device
-        )
-        free()
+        device = torch.device("cpu") if self.text_device == "cpu" else self.device
+        made = self.embed_texts(self.found, texts, device)
+        gc.collect()
+        if torch.cuda.is_available():
+            torch.cuda.empty_cache()
         return made
 
     @property
@@ -474,12 +432,12 @@ class LatentPrior(DiffusionPrior):
 def ddpm_path(scheduler: Mapping[str, Any]) -> NoisePath:
     """Return the noise path of a scheduler's configuration. Raises ``UserError`` for unknown kinds."""
     kind = scheduler.get("beta_schedule")
-    is_known = kind == "scaled_linear" and not scheduler.get("rescale_betas_zero_snr")
+    others = ("rescale_betas_zero_snr", "trained_betas")
     require(
-        is_known and scheduler.get("trained_betas") is None,
+        kind == "scaled_linear" and not any(scheduler.get(name) for name in others),
         "prior.path",
-        expected="a model with a scaled_linear noise schedule",
-        got=kind if kind != "scaled_linear" else "scaled_linear, rescaled to zero terminal SNR",
+        expected=f"a model with a scaled_linear noise schedule, without {' or '.join(others)}",
+        got=kind,
         example="prior.path=DIR",
     )
     return DDPM(
@@ -498,13 +456,6 @@ def blank_texts(count: int, config: Any, dtype: torch.dtype) -> Texts:
     if getattr(config, "addition_embed_type", None) == "text_time":
         width = config.projection_class_embeddings_input_dim - 6 * config.addition_time_embed_dim
     return Texts(tokens.to(dtype), None if width is None else torch.empty(count, width).to(dtype))
-
-
-def free() -> None:
-    """Free the memory of networks that are no longer referenced."""
-    gc.collect()
-    if torch.cuda.is_available():
-        torch.cuda.empty_cache()
 
 
 Complete = Callable[[Tensor, Tensor, Tensor], Prediction]

@@ -1,7 +1,7 @@
-"""Networks with the tensor names of latent diffusion (Rombach et al. 2022), read into classes of diffusers.
+"""MVDream as its authors published it: the tensor names of latent diffusion, read into classes of diffusers.
 
-Files of this kind contain tensors but no configuration. The configuration follows from the shapes of the
-tensors. Everything else is constant in the family of Stable Diffusion 2, the only one that is supported.
+The published file contains tensors but no configuration. The configuration is that of Stable Diffusion 2.1
+with an input for cameras, and it is written down here.
 """
 
 import json
@@ -11,26 +11,55 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from cadam3d.core.checks import fail, require
 from cadam3d.core.errors import UserError
 from cadam3d.io.pretrained import (
     LIBRARIES,
     ModelSource,
     Pretrained,
+    empty,
     fetch_file,
     read_tensors,
     require_extra,
     short,
 )
 
-HEAD = 64  # channels of one attention head, in the UNet and in the text encoder
-SCALING = 0.18215  # factor of the latents
 # For each part its class, and the prefix of its tensors' names in a file with a whole model.
 PARTS = {
     "unet": (("diffusers", "UNet2DConditionModel"), "model.diffusion_model."),
     "vae": (("diffusers", "AutoencoderKL"), "first_stage_model."),
     "text_encoder": (("transformers", "CLIPTextModel"), "cond_stage_model.model."),
+}
+CONFIGURATIONS: dict[str, dict[str, Any]] = {
+    "unet": {
+        "block_out_channels": [320, 640, 1280, 1280],
+        "cross_attention_dim": 1024,
+        "attention_head_dim": [5, 10, 20, 20],  # in diffusers, the number of heads
+        "use_linear_projection": True,
+        "class_embed_type": "projection",
+        "projection_class_embeddings_input_dim": 16,  # of a camera
+    },
+    "vae": {
+        "block_out_channels": [128, 256, 512, 512],
+        "down_block_types": ["DownEncoderBlock2D"] * 4,
+        "up_block_types": ["UpDecoderBlock2D"] * 4,
+        "layers_per_block": 2,
+        "latent_channels": 4,
+    },
+    # Without the last of 24 layers, because the model uses the states before it.
+    "text_encoder": {
+        "vocab_size": 49408,
+        "max_position_embeddings": 77,
+        "hidden_size": 1024,
+        "intermediate_size": 4096,
+        "num_hidden_layers": 23,
+        "num_attention_heads": 16,
+        "hidden_act": "gelu",
+        "bos_token_id": 49406,
+        "eos_token_id": 49407,
+    },
 }
 
 
@@ -45,45 +74,30 @@ class LatentDiffusion(Pretrained):
         """Load one part, frozen, on the CPU. Raises ``UserError`` if it is missing or damaged."""
         if name not in self.files:
             return super().part(name, dtype)
-        tensors = self._tensors(name)
-        network = self._empty(name)
+        from accelerate import init_empty_weights
+
+        kind, tensors = self._kind(name), self._tensors(name)
+        with init_empty_weights(include_buffers=False):
+            network = empty(kind, self.config(name))
         try:
             converted = CONVERSIONS[name](tensors, network)
             cast = {k: tensor if dtype is None else tensor.to(dtype) for k, tensor in converted.items()}
             network.load_state_dict(cast, assign=True)
         except (KeyError, RuntimeError, ValueError) as error:
-            raise self._unlike(name, error) from error
+            raise UserError(
+                f"{self.source.key}: {self.files[name][0]} contains no {name} of MVDream ({short(error)}). "
+                f"Try: another {self.source.key}.path"
+            ) from error
         return network.requires_grad_(False).eval()
 
     def config(self, name: str) -> dict[str, Any]:
         """Return the configuration of one part."""
-        if name not in self.files:
-            return super().config(name)
-        try:
-            return CONFIGURATIONS[name](self._tensors(name))
-        except (KeyError, IndexError) as error:
-            raise self._unlike(name, error) from error
-
-    def _empty(self, name: str) -> nn.Module:
-        """Return the network without memory for its parameters."""
-        from accelerate import init_empty_weights
-
-        kind, config = self._kind(name), self.config(name)
-        with init_empty_weights(include_buffers=False):
-            if hasattr(kind, "from_config"):
-                return kind.from_config(config)
-            return kind(kind.config_class.from_dict(config))
+        return CONFIGURATIONS[name] if name in self.files else super().config(name)
 
     def _tensors(self, name: str) -> dict[str, Tensor]:
         file, prefix = self.files[name]
         tensors = read_tensors(f"{self.source.key}.path", file)
         return {k.removeprefix(prefix): tensor for k, tensor in tensors.items() if k.startswith(prefix)}
-
-    def _unlike(self, name: str, error: Exception) -> UserError:
-        return UserError(
-            f"{self.source.key}: {self.files[name][0]} contains no {name} of the Stable Diffusion 2 family "
-            f"({short(error)}). Try: another {self.source.key}.path"
-        )
 
 
 @dataclass(frozen=True)
@@ -126,24 +140,19 @@ class SingleFile(LatentDiffusion):
     def _load_tokenizer(self) -> Any:
         from transformers import CLIPTokenizer
 
-        config = self.config("text_encoder")
-        pieces, length = config["vocab_size"], config["max_position_embeddings"]
+        config, key = self.config("text_encoder"), f"{self.source.key}.tokenizer"
+        expected = f"a folder or name on the hub with the {config['vocab_size']} pieces of CLIP's vocabulary"
         try:
-            loaded = CLIPTokenizer.from_pretrained(self.tokenizer, model_max_length=length)
+            loaded = CLIPTokenizer.from_pretrained(
+                self.tokenizer, model_max_length=config["max_position_embeddings"]
+            )
         except (OSError, ValueError) as error:
-            raise self._no_tokenizer(pieces, short(error)) from error
+            raise fail(key, expected=expected, got=self.tokenizer, example=f"{key}=DIR") from error
         # If the files are missing, transformers silently makes a tokenizer that knows no word.
-        if len(loaded) != pieces:
-            raise self._no_tokenizer(pieces, f"it knows {len(loaded)}")
+        fits = len(loaded) == config["vocab_size"]
+        require(fits, key, expected=expected, got=self.tokenizer, example=f"{key}=DIR")
         loaded.pad_token_id = 0
         return loaded
-
-    def _no_tokenizer(self, pieces: int, reason: str) -> UserError:
-        key = f"{self.source.key}.tokenizer"
-        return UserError(
-            f"{key}: expected the {pieces} pieces that the text encoder of {self.file} reads, got "
-            f"{self.tokenizer!r} ({reason}). Try: {key}=DIR, a folder with CLIP's vocab.json and merges.txt"
-        )
 
 
 def with_ldm_unet(found: Pretrained) -> Pretrained:
@@ -158,87 +167,19 @@ def with_ldm_unet(found: Pretrained) -> Pretrained:
 
 def _weights_file(found: Pretrained, part: str) -> Path:
     """Return the file with the tensors of one part of a model in the layout of diffusers."""
-    stems = [f"{part}/diffusion_pytorch_model{v}" for v in (f".{found.source.variant}", "")]
-    stems = stems[found.source.variant is None :]
-    names = [stem + suffix for suffix in (".safetensors", ".bin") for stem in stems]
+    variant = f".{found.source.variant}" if found.source.variant else ""
+    stem = f"{part}/diffusion_pytorch_model{variant}"
     reason = "no such file"
-    for name in names:
+    for name in (f"{stem}.safetensors", f"{stem}.bin"):
         file = Path(found.where) / name
         if not Path(found.where).is_dir():
             file, reason, _ = fetch_file(found.where, name, found.revision, True)
         if file is not None and file.is_file():
             return file
     raise UserError(
-        f"{found.source.key}: {found.where} has none of {', '.join(names)} ({reason}). "
-        f"Try: download it again, or another {found.source.key}.path"
+        f"{found.source.key}: {found.where} has no {stem}.safetensors ({reason}). "
+        f"Try: another {found.source.key}.path"
     )
-
-
-# --- configurations from shapes -----------------------------------------------------------------------------
-
-
-def _unet_config(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-    # Every level except the last ends with a downsampling block.
-    shrinks = _numbers(tensors, "input_blocks.", ".0.op.weight")
-    layers = min(shrinks) - 1
-    starts = [1 + level * (layers + 1) for level in range(len(shrinks) + 1)]
-    channels = [tensors[f"input_blocks.{i}.0.out_layers.3.weight"].shape[0] for i in starts]
-    attends = [f"input_blocks.{i}.1.norm.weight" in tensors for i in starts]
-    attention = "middle_block.1.transformer_blocks.0.attn2.to_k.weight"
-    config = {
-        "in_channels": tensors["input_blocks.0.0.weight"].shape[1],
-        "out_channels": tensors["out.2.weight"].shape[0],
-        "block_out_channels": channels,
-        "layers_per_block": layers,
-        "down_block_types": ["CrossAttnDownBlock2D" if each else "DownBlock2D" for each in attends],
-        "up_block_types": ["CrossAttnUpBlock2D" if each else "UpBlock2D" for each in reversed(attends)],
-        "cross_attention_dim": tensors[attention].shape[1],
-        # In diffusers, this key is the number of heads.
-        "attention_head_dim": [max(width // HEAD, 1) for width in channels],
-        "use_linear_projection": tensors["middle_block.1.proj_in.weight"].ndim == 2,
-    }
-    if "camera_embed.0.weight" in tensors:
-        dim = tensors["camera_embed.0.weight"].shape[1]
-        config |= {"class_embed_type": "projection", "projection_class_embeddings_input_dim": dim}
-    return config
-
-
-def _vae_config(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-    levels = 1 + max(_numbers(tensors, "encoder.down.", ".block.0.conv2.weight"))
-    widths = [tensors[f"encoder.down.{i}.block.0.conv2.weight"].shape[0] for i in range(levels)]
-    return {
-        "block_out_channels": widths,
-        "down_block_types": ["DownEncoderBlock2D"] * levels,
-        "up_block_types": ["UpDecoderBlock2D"] * levels,
-        "layers_per_block": 1 + max(_numbers(tensors, "encoder.down.0.block.", ".conv2.weight")),
-        "latent_channels": tensors["quant_conv.weight"].shape[0] // 2,
-        "scaling_factor": SCALING,
-    }
-
-
-def _text_config(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Return the configuration without the last layer, because the model uses the states before it."""
-    width, pieces = tensors["ln_final.weight"].shape[0], tensors["token_embedding.weight"].shape[0]
-    return {
-        "vocab_size": pieces,
-        "max_position_embeddings": tensors["positional_embedding"].shape[0],
-        "hidden_size": width,
-        "intermediate_size": tensors["transformer.resblocks.0.mlp.c_fc.weight"].shape[0],
-        "num_hidden_layers": max(_numbers(tensors, "transformer.resblocks.", ".ln_1.weight")),
-        "num_attention_heads": max(width // HEAD, 1),
-        "hidden_act": "gelu",
-        "bos_token_id": pieces - 2,
-        "eos_token_id": pieces - 1,
-    }
-
-
-def _numbers(tensors: Mapping[str, Tensor], before: str, after: str) -> list[int]:
-    """Return the numbers between ``before`` and ``after`` in the names of tensors."""
-    found = [k.removeprefix(before).removesuffix(after) for k in tensors if k.startswith(before)]
-    numbers = [int(number) for number in found if number.isdigit()]
-    if not numbers:
-        raise KeyError(f"{before}0{after} is missing")
-    return numbers
 
 
 # --- names in diffusers -------------------------------------------------------------------------------------
@@ -270,11 +211,6 @@ def _convert_text_encoder(tensors: Mapping[str, Tensor], network: Any) -> dict[s
     return converted if is_wrapped else {k.removeprefix("text_model."): t for k, t in converted.items()}
 
 
-CONFIGURATIONS: dict[str, Callable[[Mapping[str, Tensor]], dict[str, Any]]] = {
-    "unet": _unet_config,
-    "vae": _vae_config,
-    "text_encoder": _text_config,
-}
 CONVERSIONS: dict[str, Callable[[Mapping[str, Tensor], Any], dict[str, Tensor]]] = {
     "unet": _convert_unet,
     "vae": _convert_vae,

@@ -1,6 +1,5 @@
 """MVDream: denoises four views together in a UNet that reads their cameras and attends across them."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,9 +21,6 @@ from cadam3d.prior.stable_diffusion import StableDiffusion
 from cadam3d.prior.texts import Texts
 
 VIEWS = 4  # per group
-# To read a noise level waits for a GPU, so only the first predictions of a run are checked there. These are
-# more than those of one step, because an inversion may begin at one level for all views.
-CHECKED = 100
 # The network reads a camera as a matrix of four by four numbers.
 CAMERA = 16
 # Largest deviation from a quarter turn between the views of a group, and of their elevations.
@@ -63,19 +59,15 @@ class MVDream(StableDiffusion):
     kinds: ClassVar = ("MVDreamPipeline", "StableDiffusionPipeline")
 
     def __post_init__(self) -> None:
-        # This comes first because its suggestion also satisfies the check of any prior.
+        super().__post_init__()
         require(
-            self.micro_batch is None
-            or (type(self.micro_batch) is int and self.micro_batch > 0 and self.micro_batch % VIEWS == 0),
+            self.micro_batch is None or self.micro_batch % VIEWS == 0,
             "prior.micro_batch",
             expected=f"null or a multiple of {VIEWS}, since {VIEWS} views are denoised together",
             got=self.micro_batch,
             example=f"prior.micro_batch={VIEWS}",
         )
-        super().__post_init__()
         require_range("prior.rescale", self.rescale, low=0, high=1)
-        is_name = isinstance(self.tokenizer, str) and self.tokenizer != ""
-        require(is_name, "prior.tokenizer", expected="a folder or a name on the hub", got=self.tokenizer)
 
     @cached_property
     def found(self) -> Pretrained:
@@ -102,7 +94,7 @@ class MVDream(StableDiffusion):
     def embed(self, prompt: str, negative: str) -> MultiviewEmbedding:
         """Embed the texts of the prompt, the negative prompt and the empty text."""
         embedding = super().embed(prompt, negative)
-        return MultiviewEmbedding(texts=embedding.texts, prompting=embedding.prompting, hints=embedding.hints)
+        return MultiviewEmbedding(texts=embedding.texts, prompting=embedding.prompting)
 
     def denoise(
         self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras
@@ -111,20 +103,19 @@ class MVDream(StableDiffusion):
         matrices = camera_numbers(cameras).to(noisy)
         return self.network(noisy, timestep, encoder_hidden_states=texts.tokens, class_labels=matrices).sample
 
-    def load(self) -> None:
-        """Load the autoencoder and the denoiser; the noise levels of a new run are checked again."""
-        super().load()
-        vars(self)["checked"] = 0
-
     @torch.no_grad()
     def predict(
         self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: TextCondition, scale: float
     ) -> Prediction:
         """Predict every view, without gradient. Raises ``UserError`` if ``t`` differs within a group."""
-        checked = vars(self).get("checked", 0)
-        if t.device.type == "cpu" or checked < CHECKED:
-            vars(self)["checked"] = checked + 1
-            require_one_level(t)
+        levels = t.view(-1, VIEWS)
+        require(
+            bool((levels == levels[:, :1]).all()),
+            "guidance.shared_t",
+            expected="true, since prior=mvdream denoises four views together at one noise level",
+            got=False,
+            example="guidance.shared_t=true",
+        )
         return super().predict(noisy, t, condition, scale)
 
     def tempered(
@@ -162,18 +153,6 @@ def camera_numbers(cameras: Cameras) -> Float[Tensor, "v 16"]:
     return torch.cat([torch.cat([axes, centres[..., None]], dim=2), last], dim=1).flatten(1)
 
 
-def require_one_level(t: Float[Tensor, "v"]) -> None:
-    """Raise ``UserError`` unless the views of each group have one noise level."""
-    levels = t.view(-1, VIEWS)
-    require(
-        bool((levels == levels[:, :1]).all()),
-        "guidance.shared_t",
-        expected="true, since prior=mvdream denoises four views together at one noise level",
-        got=False,
-        example="guidance.shared_t=true",
-    )
-
-
 def require_whole_groups(views: int) -> None:
     """Raise ``UserError`` unless ``views`` is a multiple of four."""
     require(
@@ -199,7 +178,7 @@ def require_groups(cameras: Cameras) -> None:
         bool((off < TOLERANCE_DEG).all()),
         "camera",
         expected="groups of four views, a quarter turn apart at one elevation, for prior=mvdream",
-        got=f"azimuths {_listed(azimuth[0])} and elevations {_listed(elevation[0])} degrees",
+        got=f"azimuths {azimuth[0].tolist()} and elevations {elevation[0].tolist()} degrees",
         example="camera=multiview",
     )
 
@@ -231,7 +210,3 @@ def _spread(clean: Float[Tensor, "v c h w"]) -> Float[Tensor, "v"]:
     """Return the standard deviation over a whole group, repeated for each of its views."""
     groups = clean.reshape(len(clean) // VIEWS, -1)
     return groups.std(dim=1).clamp_min(1e-8).repeat_interleave(VIEWS)
-
-
-def _listed(values: Sequence[float] | Tensor) -> str:
-    return ", ".join(f"{float(value):.0f}" for value in values)

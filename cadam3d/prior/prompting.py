@@ -6,6 +6,7 @@ texts. Azimuth 0 is the front. This module is independent of networks: a :class:
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -200,7 +201,7 @@ class PerpNeg(Prompting):
 def guide(
     negative: Float[Tensor, "v *rest"],
     positive: Float[Tensor, "v *rest"],
-    repelled: Float[Tensor, "m v *rest"],
+    repelled: Sequence[Float[Tensor, "v *rest"]],
     strengths: Float[Tensor, "v m"],
     scale: float,
 ) -> Float[Tensor, "v *rest"]:

@@ -10,7 +10,7 @@ from cadam3d.core.rendering import Truth
 from cadam3d.prior.base import DiffusionPrior
 from cadam3d.prior.shapes.prior import true_scene
 from cadam3d.prior.shapes.scene import build
-from cadam3d.prior.shapes.tracers import TRACERS, find_tracer
+from cadam3d.prior.shapes.tracing import TRACERS, find_tracer
 
 MOST_TURNS = 72
 

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from cadam3d.core.cameras import Cameras
 from cadam3d.io.atomic import replacing
 from cadam3d.prior.shapes.scene import build
-from cadam3d.prior.shapes.tracers import find_tracer
+from cadam3d.prior.shapes.tracing import find_tracer
 
 GROUPS = 512  # per file, at most
 SAMPLES = 2  # rays per pixel, along each axis

@@ -20,7 +20,8 @@ from torch.nn.functional import normalize
 from cadam3d.camera.multiview import Multiview
 from cadam3d.core.cameras import orbit, turntable
 from cadam3d.core.errors import UserError
-from cadam3d.prior import mvdream
+from cadam3d.io.pretrained import empty
+from cadam3d.prior import ldm
 from cadam3d.prior.mvdream import MVDream
 from cadam3d.prior.prompting import Plain
 
@@ -46,10 +47,21 @@ def prior(folder, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def file(pipe, tmp_path_factory):
-    """The path of a single file that holds the whole model, as published."""
+    """The path of a single file that holds the whole model, as published but with small networks."""
     file = tmp_path_factory.mktemp("published") / "sd-v2.1-base-4view.pt"
     torch.save(single_file(pipe.unet, pipe.vae, pipe.text_encoder), file)
     return file
+
+
+@pytest.fixture(autouse=True)
+def small(pipe, monkeypatch):
+    """Let published files have the small networks of the pipeline."""
+    parts = {"unet": pipe.unet, "vae": pipe.vae, "text_encoder": pipe.text_encoder}
+    configurations = {
+        name: dict(part.config.to_dict() if name == "text_encoder" else part.config)
+        for name, part in parts.items()
+    }
+    monkeypatch.setattr(ldm, "CONFIGURATIONS", configurations)
 
 
 def views(count=4, size=64):
@@ -143,19 +155,6 @@ def test_latents_are_those_of_the_autoencoder(prior, pipe):
     encodes_like_the_autoencoder(prior, pipe.vae)
 
 
-def test_on_a_gpu_the_levels_of_the_first_predictions_of_a_run_are_checked(prior, monkeypatch):
-    """An inversion begins at one level for all views, so the first prediction would not be enough."""
-    checked = []
-    condition, nothing = condition_of(prior, views()), guess_of(prior, normal(4, 4, 8, 8), views())
-    monkeypatch.setattr(mvdream, "require_one_level", checked.append)
-    monkeypatch.setattr(mvdream.StableDiffusion, "predict", lambda *arguments: nothing)
-    for _ in range(2):
-        prior.load()
-        for _ in range(mvdream.CHECKED + 2):
-            prior.predict(normal(4, 4, 8, 8), torch.zeros(4, device="meta"), condition, 1.0)
-    assert len(checked) == 2 * mvdream.CHECKED
-
-
 def test_micro_batch_does_not_change_results(prior):
     micro_batch_changes_nothing(prior, size=4, condition=condition_of(prior, views(8)), channels=4)
 
@@ -237,7 +236,7 @@ def test_a_tokenizer_that_does_not_fit_is_refused(prior, file, tmp_path, where):
     if where == "other":
         (tmp_path / "vocab.json").write_text(json.dumps({"a": 0, "<|startoftext|>": 1, "<|endoftext|>": 2}))
         (tmp_path / "merges.txt").write_text("#version: 0.2\n")
-    with pytest.raises(UserError, match=r"^prior\.tokenizer: expected the 519 pieces"):
+    with pytest.raises(UserError, match=r"^prior\.tokenizer: expected .* 519 pieces"):
         replace(prior, path=str(file), tokenizer=str(tmp_path)).embed("a corgi", "")
 
 
@@ -250,17 +249,26 @@ def test_a_folder_with_the_published_names_in_its_unet_is_the_same_model(prior, 
     (model / "model_index.json").write_text(json.dumps(index))
     there = replace(prior, path=str(model))
     (model / "unet").mkdir()
-    with pytest.raises(UserError, match=r"has none of unet/diffusion_pytorch_model\.safetensors"):
+    with pytest.raises(UserError, match=r"has no unet/diffusion_pytorch_model\.safetensors"):
         there.embed("a corgi", "")
     torch.save(unet_names(pipe.unet), model / "unet" / "diffusion_pytorch_model.bin")
     is_the_same(replace(there), prior)
 
 
-def test_a_file_without_cameras_is_refused(prior, file, tmp_path):
-    tensors = {k: v for k, v in torch.load(file).items() if "camera_embed" not in k}
-    torch.save(tensors, tmp_path / "sd.pt")
+def test_a_model_without_cameras_is_refused(prior, pipelines):
     with pytest.raises(UserError, match=r"expected an MVDream model, .* Try: prior=stable_diffusion"):
-        replace(prior, path=str(tmp_path / "sd.pt")).embed("a corgi", "")
+        replace(prior, path=str(pipelines("stable_diffusion"))).embed("a corgi", "")
+
+
+def test_the_published_configuration_has_the_sizes_of_the_model(monkeypatch):
+    """The file has 1.4 million parameters more than Stable Diffusion 2.1, all of them for the cameras."""
+    monkeypatch.undo()
+    with torch.device("meta"):
+        unet = empty(diffusers.UNet2DConditionModel, ldm.CONFIGURATIONS["unet"])
+        vae = empty(diffusers.AutoencoderKL, ldm.CONFIGURATIONS["vae"])
+    counts = [sum(p.numel() for p in network.parameters()) for network in (unet, vae)]
+    cameras = 1280 * (16 + 1) + 1280 * (1280 + 1)
+    assert counts == [865_910_724 + cameras, 83_653_863]
 
 
 def test_a_damaged_or_unsupported_file_gives_a_message_of_one_line(prior, file, folder, tmp_path):
@@ -290,7 +298,7 @@ def test_nothing_in_a_file_is_executed(prior, tmp_path):
 
     torch.save({"weight": torch.zeros(1), "code": Malicious()}, tmp_path / "evil.pt")
     with pytest.raises(UserError, match="is not a file of tensors"):
-        replace(prior, path=str(tmp_path / "evil.pt")).found  # noqa: B018
+        replace(prior, path=str(tmp_path / "evil.pt")).network  # noqa: B018
 
 
 # --- requirements -----------------------------------------------------------------------------------------
@@ -304,7 +312,7 @@ def test_views_must_come_in_groups_of_four(prior, count, key):
 
 def test_views_of_a_group_must_be_a_quarter_turn_apart(prior):
     cameras = turntable(8, elevation_deg=0.0, distance=3.0, fov_y_deg=40.0, size=64)
-    with pytest.raises(UserError, match=r"^camera: expected groups of four views.*azimuths 0, 45, 90, 135"):
+    with pytest.raises(UserError, match=r"^camera: expected groups of four views.*azimuths"):
         condition_of(prior, cameras)
     regrouped = cameras.index(torch.tensor([6, 0, 2, 4, 7, 1, 3, 5]))
     assert len(condition_of(prior, regrouped).cameras) == 8
@@ -312,7 +320,7 @@ def test_views_of_a_group_must_be_a_quarter_turn_apart(prior):
 
 def test_views_of_a_group_must_have_one_elevation(prior):
     cameras = level_with(elevation=torch.tensor([0.0, 0.0, 0.0, 20.0]))
-    with pytest.raises(UserError, match=r"^camera: expected groups of four views.*elevations 0, 0, 0, 20"):
+    with pytest.raises(UserError, match=r"^camera: expected groups of four views.*elevations"):
         condition_of(prior, cameras)
 
 

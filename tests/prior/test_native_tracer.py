@@ -19,8 +19,8 @@ from cadam3d.prior.shapes.objects import Coat, Part, known_objects, known_primit
 from cadam3d.prior.shapes.scene import PATTERN_NAMES, Scene, compile_scene
 from cadam3d.prior.shapes.solids import KINDS, Solid
 from cadam3d.prior.shapes.tracer import Layers, trace
-from cadam3d.prior.shapes.tracers import find_tracer, tracer_for
-from cadam3d.prior.shapes.vocabulary import COLOURS, NUMBERS, PATTERNS, SIZES, STRETCHES
+from cadam3d.prior.shapes.tracing import find_tracer, tracer_for
+from cadam3d.prior.shapes.words import COLOURS, NUMBERS, PATTERNS, SIZES, STRETCHES
 from cadam3d.prior.truth import ShapesTruth
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")

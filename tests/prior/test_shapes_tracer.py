@@ -11,7 +11,7 @@ from cadam3d.prior.shapes.grammar import parse
 from cadam3d.prior.shapes.objects import Part, known_objects, known_primitives
 from cadam3d.prior.shapes.scene import FIT_RADIUS, Scene, assemble, build, compile_scene, sphere_directions
 from cadam3d.prior.shapes.tracer import AMBIENT, DIFFUSE, LIGHT, SKY, WRAP, Layers, trace
-from cadam3d.prior.shapes.vocabulary import COLOURS
+from cadam3d.prior.shapes.words import COLOURS
 
 PROMPTS = (
     "a red and yellow checkered torus",

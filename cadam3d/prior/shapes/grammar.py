@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
-from cadam3d.prior.shapes.vocabulary import (
+from cadam3d.prior.shapes.words import (
+    ADJECTIVES,
     ARTICLES,
     COLOUR_ALIASES,
     COLOURS,
@@ -20,26 +21,20 @@ from cadam3d.prior.shapes.vocabulary import (
     NUMBERS,
     PATTERNS,
     RELATIONS,
+    SHADES,
     SIZES,
     STRETCHES,
-)
-from cadam3d.prior.shapes.words import (
-    ADJECTIVES,
-    SHADES,
-    is_known,
     is_plural,
     known_words,
     noun_of,
-    typed_words,
+    vocabulary,
     words_of,
 )
 
+MOST_NAMED = 20  # unknown words in one message
 EXAMPLE = "a red and yellow checkered torus"
 MAX_COLOURS = 2
 MAX_OBJECTS = 200  # of one prompt; sentences nest, and Python limits how deeply
-MAX_NAMED = 20  # unknown words in one message
-MAX_SHOWN = 300  # characters of a prompt in a message
-LIST = "docs/shapes.md"  # the page that lists all words
 SIMILAR = 0.78  # of difflib's ratio, in [0, 1]; one letter of five may differ, but not one of four
 
 
@@ -71,7 +66,9 @@ def parse(prompt: str, key: str = "prompt") -> Sentence:
     the sentence.
     """
     words = words_of(prompt)
-    _reject_unknown(key, prompt, words)
+    unknown = [word for word in words if word not in vocabulary() and noun_of(word) is None]
+    known = [word for group in known_words().values() for word in group]
+    require_words(key, unknown, known, "prior=shapes (docs/shapes.md)", EXAMPLE)
     reader = _Reader(key, prompt, [word for word in words if word not in FILLERS | ARTICLES])
     if sum(noun_of(word) is not None for word in words) > MAX_OBJECTS:
         raise reader.fail(f"at most {MAX_OBJECTS} objects")
@@ -148,40 +145,22 @@ class _Reader:
         return self.words[self.position] if self.position < len(self.words) else None
 
     def fail(self, expected: str) -> UserError:
-        return fail(self.key, expected=expected, got=shown(self.prompt), example=f'{self.key}="{EXAMPLE}"')
+        return fail(self.key, expected=expected, got=self.prompt, example=f'{self.key}="{EXAMPLE}"')
 
 
-def _reject_unknown(key: str, prompt: str, words: list[str]) -> None:
-    typed = {word.lower(): word for word in typed_words(prompt)}
-    unknown = [typed.get(word, word) for word in dict.fromkeys(words) if not is_known(word)]
-    if unknown:
-        known = [word for group in known_words().values() for word in group]
-        raise unknown_words(key, unknown, known, "prior=shapes", LIST, f'{key}="{EXAMPLE}"')
+def require_words(
+    key: str, unknown: Sequence[str], known: Collection[str], reader: str, example: str
+) -> None:
+    """Raise ``UserError`` with the known words of the nearest spelling if there are ``unknown`` words.
 
-
-def unknown_words(
-    key: str, unknown: Sequence[str], known: Collection[str], reader: str, listed: str, example: str
-) -> UserError:
-    """Return the error for words of a prompt that ``reader``, such as ``prior=shapes``, does not know.
-
-    ``listed`` is the file that lists the ``known`` words, and ``example`` is what to type.
+    ``reader`` is what reads the prompt in the setting ``key``, and ``example`` is another prompt.
     """
-    names = ", ".join(_named(word, known) for word in unknown[:MAX_NAMED])
-    if len(unknown) > MAX_NAMED:
-        names += f" and {len(unknown) - MAX_NAMED} more"
-    return UserError(
-        f"{key}: expected words that {reader} knows, got {names}. {listed} lists all of them; "
-        f"most other priors read free text. Try: {example}"
-    )
-
-
-def _named(word: str, known: Collection[str]) -> str:
-    """Return an unknown word with the known word of the nearest spelling."""
+    if not unknown:
+        return
     # Sorted, since the order of a set differs between processes and decides between equally near words.
-    near = difflib.get_close_matches(word.lower(), sorted(known), n=1, cutoff=SIMILAR)
-    return f"{shown(word)!r}" + (f" (nearest: {near[0]})" if near else "")
-
-
-def shown(text: str) -> str:
-    """Return a text as messages show it: cut if it is long."""
-    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
+    words = sorted(known)
+    names = []
+    for word in [*dict.fromkeys(unknown)][:MOST_NAMED]:
+        near = difflib.get_close_matches(word, words, n=1, cutoff=SIMILAR)
+        names.append(f"{word!r} (nearest: {near[0]})" if near else repr(word))
+    raise UserError(f'{key}: expected words of {reader}, got {", ".join(names)}. Try: {key}="{example}"')

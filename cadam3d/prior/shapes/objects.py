@@ -30,8 +30,8 @@ from cadam3d.prior.shapes.solids import (
     torus,
     tube,
 )
-from cadam3d.prior.shapes.vocabulary import PLAIN
 
+PLAIN = "plain"  # the pattern of one colour
 # Colours that the prompt may choose.
 MAIN, ACCENT = "main", "accent"
 # A colour that the prompt leaves open. It gives one mode per colour of the palette.

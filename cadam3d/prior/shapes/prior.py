@@ -13,14 +13,12 @@ from cadam3d.core.checks import fail, require_choice, require_range, require_who
 from cadam3d.core.rendering import Truth
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import NoisePath, Prediction, per_view
-from cadam3d.prior.shapes.array_cache import cached_arrays
 from cadam3d.prior.shapes.grammar import EXAMPLE
 from cadam3d.prior.shapes.mixture import Mixture
 from cadam3d.prior.shapes.objects import known_objects, known_primitives
 from cadam3d.prior.shapes.scene import Scene, build, signed_distance
-from cadam3d.prior.shapes.trace_cache import shared_trace
 from cadam3d.prior.shapes.tracer import Layers
-from cadam3d.prior.shapes.tracers import TRACERS, find_tracer
+from cadam3d.prior.shapes.tracing import TRACERS, find_tracer, shared_trace, stored_arrays
 
 CENSUS_VIEWS = 4  # per object, equally spaced in azimuth
 CENSUS_ELEVATION_DEG = 15.0
@@ -281,11 +279,11 @@ def _enlarged(
 def take_census(size: int, tracer: str) -> Census:
     """Return the moments over all objects of the world, a few views of each and all modes, equally likely."""
     name = f"census-{size}-{find_tracer(tracer).identity}"
-    return cached_arrays(Census, name, lambda: _measure(size, tracer))
+    return Census(**stored_arrays(name, lambda: _measure(size, tracer)))
 
 
-def _measure(size: int, tracer: str) -> Census:
-    """Compute the census by tracing every object."""
+def _measure(size: int, tracer: str) -> dict[str, Tensor]:
+    """Compute the census by tracing every object, and return its maps by name."""
     cameras = turntable(
         CENSUS_VIEWS,
         elevation_deg=CENSUS_ELEVATION_DEG,
@@ -309,10 +307,10 @@ def _measure(size: int, tracer: str) -> Census:
         alpha_square += alpha.square().mean(0)
     count = len(names)
     rgb, alpha = rgb_sum / count, alpha_sum / count
-    return Census(
-        rgb=rgb,
-        alpha=alpha,
-        rgb_variance=rgb_square / count - rgb**2,
-        alpha_variance=alpha_square / count - alpha**2,
-        covariance=cross / count - rgb * alpha,
-    )
+    return {
+        "rgb": rgb,
+        "alpha": alpha,
+        "rgb_variance": rgb_square / count - rgb**2,
+        "alpha_variance": alpha_square / count - alpha**2,
+        "covariance": cross / count - rgb * alpha,
+    }

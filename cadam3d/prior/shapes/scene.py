@@ -12,6 +12,7 @@ from cadam3d.prior.shapes.objects import (
     ACCENT,
     MAIN,
     OPEN,
+    PLAIN,
     Coat,
     Part,
     Thing,
@@ -21,7 +22,7 @@ from cadam3d.prior.shapes.objects import (
     thing,
 )
 from cadam3d.prior.shapes.solids import KINDS, Kind, size_row
-from cadam3d.prior.shapes.vocabulary import COLOURS, OPEN_PALETTE, PATTERNS, PLAIN
+from cadam3d.prior.shapes.words import COLOURS, OPEN_PALETTE, PATTERNS
 
 # Every scene fits in the ball of this radius around the origin.
 FIT_RADIUS = 0.85

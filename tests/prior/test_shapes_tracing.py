@@ -1,4 +1,4 @@
-"""The trace cache: bit-identical images, traced once, and no errors if the cache cannot be used."""
+"""Stored traces and arrays: the same bits, computed once, and no errors if nothing can be stored."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,10 +9,10 @@ import torch
 from cadam3d.compiled.library import find_compiler
 from cadam3d.core.cameras import Cameras, turntable
 from cadam3d.io.cache import TRACES
-from cadam3d.prior.shapes import trace_cache
+from cadam3d.prior.shapes import prior, tracing
 from cadam3d.prior.shapes.scene import Scene, build
 from cadam3d.prior.shapes.tracer import Layers
-from cadam3d.prior.shapes.tracers import Tracer, tracer_for
+from cadam3d.prior.shapes.tracing import Tracer, tracer_for
 
 FLOATS = {"device": torch.device("cpu"), "dtype": torch.float32}
 
@@ -45,7 +45,7 @@ def traced(monkeypatch) -> list[int]:
 
         return replace(chosen, trace=count)
 
-    monkeypatch.setattr(trace_cache, "tracer_for", counting)
+    monkeypatch.setattr(tracing, "tracer_for", counting)
     return calls
 
 
@@ -61,8 +61,8 @@ def same(one: Layers, other: Layers) -> bool:
 @pytest.mark.parametrize("prompt", ["a robot", "a cube", "three red and white spotted balls under a tree"])
 def test_a_cached_trace_is_bit_identical(prompt, samples, folder, traced) -> None:
     expected = trace(scene_of(prompt), cameras(), samples)
-    first = trace_cache.shared_trace(scene_of(prompt), cameras(), samples)
-    second = trace_cache.shared_trace(scene_of(prompt), cameras(), samples)
+    first = tracing.shared_trace(scene_of(prompt), cameras(), samples)
+    second = tracing.shared_trace(scene_of(prompt), cameras(), samples)
     assert len(traced) == 1
     assert same(first, expected)
     assert same(second, expected)
@@ -84,14 +84,14 @@ def test_a_cached_trace_is_bit_identical(prompt, samples, folder, traced) -> Non
 )
 def test_a_trace_is_repeated_if_anything_changes_the_image(other, folder, traced) -> None:
     first = (scene_of("a red and white checkered cube"), cameras(), 1)
-    trace_cache.shared_trace(*first)
-    assert same(trace_cache.shared_trace(*other(*first)), trace(*other(*first)))
+    tracing.shared_trace(*first)
+    assert same(tracing.shared_trace(*other(*first)), trace(*other(*first)))
     assert len(traced) == 2
 
 
 def test_scenes_that_differ_in_colour_share_a_trace(folder, traced) -> None:
     for prompt in ("a red cube", "a blue cube"):
-        trace_cache.shared_trace(scene_of(prompt), cameras(), 1)
+        tracing.shared_trace(scene_of(prompt), cameras(), 1)
     assert len(traced) == 1
 
 
@@ -99,35 +99,62 @@ def test_every_tracer_has_its_own_files(folder) -> None:
     """The last bits may differ, and a trace must not depend on the runs before it."""
     settings = ["torch", "native"] if find_compiler() else ["torch"]
     for setting in settings:
-        trace_cache.shared_trace(scene_of("a cube"), cameras(), 1, setting)
+        tracing.shared_trace(scene_of("a cube"), cameras(), 1, setting)
     assert len(list(folder.iterdir())) == len(settings)
 
 
-@pytest.mark.parametrize("damage", [b"", b"\x93NUMPY", b"no array at all"], ids=["empty", "cut", "other"])
+@pytest.mark.parametrize("damage", [b"", b"no array at all"], ids=["cut", "other"])
 def test_a_damaged_file_is_replaced_by_a_new_trace(damage, folder, traced) -> None:
     given = (scene_of("a cube"), cameras(), 1)
-    expected = trace_cache.shared_trace(*given)
+    expected = tracing.shared_trace(*given)
     [file] = folder.iterdir()
     file.write_bytes(damage or file.read_bytes()[:-9])
-    assert same(trace_cache.shared_trace(*given), expected)
-    assert same(trace_cache.shared_trace(*given), expected)
+    assert same(tracing.shared_trace(*given), expected)
+    assert same(tracing.shared_trace(*given), expected)
     assert len(traced) == 2
 
 
 @pytest.mark.parametrize("trouble", ["a file in its place", "a full disk"])
 def test_tracing_works_if_nothing_can_be_stored(trouble, folder, monkeypatch) -> None:
     if trouble == "a full disk":
-        monkeypatch.setattr(trace_cache, "SPARE", 2**62)
+        monkeypatch.setattr(tracing, "SPARE", 2**62)
     else:
         folder.write_text("")
     given = (scene_of("a cube"), cameras(), 1)
     for _ in range(2):
-        assert same(trace_cache.shared_trace(*given), trace(*given))
+        assert same(tracing.shared_trace(*given), trace(*given))
     assert folder.is_file() or list(folder.iterdir()) == []
 
 
 def test_without_the_variable_nothing_is_written(tmp_path, monkeypatch) -> None:
     monkeypatch.delenv(TRACES, raising=False)
     monkeypatch.chdir(tmp_path)
-    trace_cache.shared_trace(scene_of("a cube"), cameras(), 1)
+    tracing.shared_trace(scene_of("a cube"), cameras(), 1)
     assert list(tmp_path.iterdir()) == []
+
+
+# --- the census -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "cadam3d" / "shapes"
+
+
+def census() -> dict[str, torch.Tensor]:
+    return vars(prior.take_census.__wrapped__(4, "auto"))
+
+
+def test_the_second_process_reads_the_bits_of_the_first(cache, monkeypatch) -> None:
+    made = census()
+    monkeypatch.setattr(prior, "_measure", lambda size, tracer: pytest.fail("the arrays were stored"))
+    assert all(torch.equal(found, made[name]) for name, found in census().items())
+    assert [path.name[:9] for path in cache.iterdir()] == ["census-4-"]
+
+
+def test_another_number_of_threads_makes_another_file(cache, monkeypatch) -> None:
+    census()
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 77)
+    census()
+    assert len(list(cache.iterdir())) == 2
