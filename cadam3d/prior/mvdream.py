@@ -21,6 +21,9 @@ from cadam3d.prior.stable_diffusion import StableDiffusion
 from cadam3d.prior.texts import Texts
 
 VIEWS = 4  # per group
+# To read a noise level waits for a GPU, so only the first predictions of a run are checked there. These are
+# more than those of one step, because an inversion may begin at one level for all views.
+CHECKED = 100
 # The network reads a camera as a matrix of four by four numbers.
 CAMERA = 16
 # Largest deviation from a quarter turn between the views of a group, and of their elevations.
@@ -103,19 +106,20 @@ class MVDream(StableDiffusion):
         matrices = camera_numbers(cameras).to(noisy)
         return self.network(noisy, timestep, encoder_hidden_states=texts.tokens, class_labels=matrices).sample
 
+    def load(self) -> None:
+        """Load the autoencoder and the denoiser; the noise levels of a new run are checked again."""
+        super().load()
+        vars(self)["checked"] = 0
+
     @torch.no_grad()
     def predict(
         self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: TextCondition, scale: float
     ) -> Prediction:
         """Predict every view, without gradient. Raises ``UserError`` if ``t`` differs within a group."""
-        levels = t.view(-1, VIEWS)
-        require(
-            bool((levels == levels[:, :1]).all()),
-            "guidance.shared_t",
-            expected="true, since prior=mvdream denoises four views together at one noise level",
-            got=False,
-            example="guidance.shared_t=true",
-        )
+        checked = vars(self).get("checked", 0)
+        if t.device.type == "cpu" or checked < CHECKED:
+            vars(self)["checked"] = checked + 1
+            require_one_level(t)
         return super().predict(noisy, t, condition, scale)
 
     def tempered(
@@ -151,6 +155,18 @@ def camera_numbers(cameras: Cameras) -> Float[Tensor, "v 16"]:
     views = len(cameras)
     last = torch.cat([to_world.new_zeros(views, 1, 3), to_world.new_ones(views, 1, 1)], dim=2)
     return torch.cat([torch.cat([axes, centres[..., None]], dim=2), last], dim=1).flatten(1)
+
+
+def require_one_level(t: Float[Tensor, "v"]) -> None:
+    """Raise ``UserError`` unless the views of each group have one noise level."""
+    levels = t.view(-1, VIEWS)
+    require(
+        bool((levels == levels[:, :1]).all()),
+        "guidance.shared_t",
+        expected="true, since prior=mvdream denoises four views together at one noise level",
+        got=False,
+        example="guidance.shared_t=true",
+    )
 
 
 def require_whole_groups(views: int) -> None:

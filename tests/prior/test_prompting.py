@@ -177,14 +177,14 @@ def random(*shape, seed=0):
 
 def test_without_repulsion_guidance_has_the_conventional_form():
     negative, positive = random(2, 3, 4, 4), random(2, 3, 4, 4, seed=1)
-    guided = guide(negative, positive, negative[None][:0], negative.new_zeros(2, 0), 7.5)
+    guided = guide(negative, positive, [], negative.new_zeros(2, 0), 7.5)
     torch.testing.assert_close(guided, negative + 7.5 * (positive - negative))
 
 
 def test_repulsion_acts_across_the_prompt_only():
     negative, positive = random(2, 3, 4, 4), random(2, 3, 4, 4, seed=1)
     others, strengths = random(2, 2, 3, 4, 4, seed=2), -random(2, 2, seed=3).abs()
-    guided = guide(negative, positive, others, strengths, 1.0)
+    guided = guide(negative, positive, list(others), strengths, 1.0)
     direction = (positive - negative).flatten(1)
     extra = (guided - positive).flatten(1)
     torch.testing.assert_close((extra * direction).sum(dim=1), torch.zeros(2).double(), atol=1e-10, rtol=0)
@@ -199,5 +199,5 @@ def test_repulsion_acts_across_the_prompt_only():
 def test_the_component_along_the_prompt_is_not_repelled():
     negative, positive = random(1, 3, 4, 4), random(1, 3, 4, 4, seed=1)
     along = negative + 3 * (positive - negative)
-    guided = guide(negative, positive, along[None], -torch.ones(1, 1).double(), 5.0)
+    guided = guide(negative, positive, [along], -torch.ones(1, 1).double(), 5.0)
     torch.testing.assert_close(guided, negative + 5 * (positive - negative))

@@ -273,7 +273,7 @@ def test_a_model_that_is_not_on_disk_is_lacking_and_the_hub_is_not_queried(make,
     ("changes", "word"),
     [
         ({"beta_schedule": "squaredcos_cap_v2"}, "scaled_linear"),
-        ({"rescale_betas_zero_snr": True}, "zero terminal SNR"),
+        ({"rescale_betas_zero_snr": True}, "rescale_betas_zero_snr"),
         ({"prediction_type": "flow"}, "epsilon"),
     ],
 )
