@@ -37,16 +37,17 @@ class DamagedCheckpointError(UserError):
 
     def __init__(self, path: Path, reason: object) -> None:
         words = " ".join(str(reason).split())[:200] or type(reason).__name__
-        super().__init__(f"{path}: cannot be read as a checkpoint ({words}). Try: {_another(path)}")
+        super().__init__(f"{path}: cannot be read as a checkpoint ({words}). Try: resume=RUN of another run")
 
 
 def save_checkpoint(path: Path, payload: Mapping[str, Any]) -> None:
     """Write ``payload`` (dicts, lists, tensors, numbers, strings, None) atomically.
 
-    Raises ``UserError`` if the file cannot be written, and ``TypeError`` for a value that
+    Raises ``UserError`` if the file cannot be written, and ``ValueError`` for a value that
     :func:`load_checkpoint` would refuse, because the error is better raised now than when the run is resumed.
     """
     content = {"format": FORMAT, "version": VERSION, "payload": _plain(payload)}
+    _require_plain(content)
     # Written to memory first, because a full disk would cause an obscure error in torch's archive writer.
     buffer = io.BytesIO()
     torch.save(content, buffer)
@@ -68,18 +69,10 @@ def load_checkpoint(path: Path) -> Any:
             file.seek(0)
             content = torch.load(file, map_location="cpu", weights_only=True)
         _require_plain(content)
-    except FileNotFoundError as error:
-        raise DamagedCheckpointError(path, "no such checkpoint") from error
-    except UserError as error:
-        raise DamagedCheckpointError(path, "it is not a regular file") from error
+        if (content["format"], content["version"]) != (FORMAT, VERSION):
+            raise ValueError(f"its version is not {VERSION}, which this cadam3d reads")
     except Exception as error:
         raise DamagedCheckpointError(path, error) from error
-    is_own = type(content) is dict and set(content) == {"format", "version", "payload"}
-    if not is_own or type(content["format"]) is not str or content["format"] != FORMAT:
-        raise DamagedCheckpointError(path, "not a cadam3d checkpoint")
-    if type(content["version"]) is not int or content["version"] != VERSION:
-        written = str(content["version"])[:20]
-        raise DamagedCheckpointError(path, f"version {written}, this cadam3d reads {VERSION}")
     return content["payload"]
 
 
@@ -98,13 +91,12 @@ def latest_checkpoint(
             content = read(path)
         except DamagedCheckpointError as error:
             problems.append(error)
-        else:
-            for problem in problems:
-                on_damage(problem)
-            return path, content
+            continue
+        for problem in problems:
+            on_damage(problem)
+        return path, content
     if problems:
-        reason = str(problems[0]).partition(" Try: ")[0]
-        raise UserError(f"{reason} No other checkpoint there is sound. Try: a new run, without resume=...")
+        raise problems[0]
     return None
 
 
@@ -163,29 +155,15 @@ def _is_plain_tensor(tensor: Tensor) -> bool:
     return tensor.dtype != torch.bool or not bool((tensor.view(torch.uint8) > 1).any())
 
 
-def _another(path: Path) -> str:
-    """Return what to type instead of a damaged checkpoint."""
-    others = [other for other in checkpoints(path.parent) if other.name != path.name]
-    return f"resume={others[-1]}" if others else "resume=RUN with the folder of another run"
-
-
 def _plain(value: Any) -> Any:
-    """Return ``value`` with tensors on the CPU and without hidden storage; refuse what is not plain data."""
+    """Return ``value`` with tensors on the CPU and without hidden storage."""
     if isinstance(value, Tensor):
         tensor = value.detach().cpu().contiguous()
         is_view = tensor.untyped_storage().nbytes() != tensor.nbytes
         # Torch would save the whole storage of a view.
         return tensor.clone() if is_view else tensor
     if isinstance(value, Mapping):
-        return {_plain_key(key): _plain(item) for key, item in value.items()}
+        return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return type(value)(_plain(item) for item in value)
-    if value is None or type(value) in (bool, int, float, str):
-        return value
-    raise TypeError(f"a checkpoint holds plain data only, not {type(value).__name__}")
-
-
-def _plain_key(key: object) -> object:
-    if type(key) not in (str, int):
-        raise TypeError(f"keys of a checkpoint are strings or integers, not {type(key).__name__}")
-    return key
+    return value

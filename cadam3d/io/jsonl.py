@@ -78,7 +78,7 @@ def read_json(path: Path) -> Any:
     """Return the value in a JSON file.
 
     Raises ``UserError`` if it is missing, or not plain JSON: UTF-8, without NaN, infinities, numbers beyond
-    those of floating point, keys that appear twice, and more levels than any file of a run has.
+    those of floating point, and more levels than any file of a run has.
     """
     content = read_bytes(path, largest=LARGEST_TEXT)
     try:
@@ -107,20 +107,9 @@ def to_json(value: Any, indent: int | None = None) -> str:
 
 def parse_json(content: bytes) -> Any:
     """Return the value of a JSON text. Raises ``ValueError`` or ``RecursionError`` for any other text."""
-    value = json.loads(content.decode("utf-8"), object_pairs_hook=_object, parse_constant=_refused)
+    value = json.loads(content.decode("utf-8"))
     _require_plain(value, DEEPEST)
     return value
-
-
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise ValueError("a key appears twice")
-    return found
-
-
-def _refused(name: str) -> None:
-    raise ValueError(f"{name} is not JSON")
 
 
 def _require_plain(value: Any, levels: int) -> None:

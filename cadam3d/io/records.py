@@ -4,8 +4,8 @@ Numbers and text in these files may come from a stranger, and reports calculate 
 only entries of the kinds that training writes.
 """
 
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,6 @@ DECADES = 300  # powers of ten below and above 1
 # The entry of summary.json and of eval.json with what metrics declare about their numbers, by name.
 NUMBERS = "numbers"
 MOST_DIGITS = 10
-LONGEST_TEXT = 200  # characters of a label
 # The entry of summary.json and of eval.json with a record of how each number was measured, by its name.
 MEASUREMENTS = "measurements"
 # Entries of such a record that may differ between the assets of one table. All others describe how the number
@@ -53,18 +52,18 @@ def declared(facts: Mapping[str, Any]) -> dict[str, Number]:
 
     Declarations of another form than :meth:`Number.declaration` returns are left out.
     """
-    entries = facts.get(NUMBERS)
-    pairs = entries.items() if isinstance(entries, dict) else ()
-    found = {name: Number(name=name, **entry) for name, entry in pairs if _is_declaration(entry)}
-    return {COUNT.name: COUNT} | found
+    from pydantic import TypeAdapter  # takes a tenth of a second to load
 
-
-def _is_declaration(entry: Any) -> bool:
-    return (
-        isinstance(entry, dict)
-        and DECLARED.keys() >= entry.keys() >= {"label", "digits", "is_more_better"}
-        and all(DECLARED[key](value) for key, value in entry.items())
-    )
+    entries, found = facts.get(NUMBERS), {COUNT.name: COUNT}
+    adapter = TypeAdapter(Number)
+    for name, entry in entries.items() if isinstance(entries, dict) else ():
+        with suppress(ValueError, TypeError):
+            number = adapter.validate_python({**entry, "name": name})
+            # A terminal would obey control characters.
+            texts = f"{number.label}{number.unit}{number.explained}"
+            if texts.isprintable() and 0 <= number.digits <= MOST_DIGITS:
+                found[name] = number
+    return found
 
 
 def psnr_of(summary: Mapping[str, Any]) -> float | None:
@@ -168,10 +167,9 @@ def difference(name: str, scores: Iterable[Score]) -> str | None:
     """
     methods = [score.method for score in scores]
     for key in dict.fromkeys(key for method in methods for key in method):
-        values = Counter(method.get(key, "unknown") for method in methods)
+        values = sorted({method.get(key, "unknown") for method in methods})
         if len(values) > 1:
-            listed = " and ".join(f"{value} ({count})" for value, count in values.most_common())
-            return f"{name} was measured in different ways: {key} is {listed}"
+            return f"{name} was measured in different ways: {key} is {' and '.join(values)}"
     return None
 
 
@@ -256,10 +254,6 @@ def _is_text_or_none(value: object) -> bool:
     return value is None or isinstance(value, str)
 
 
-def _is_label(value: object) -> bool:
-    return isinstance(value, str) and 0 < len(value) <= LONGEST_TEXT and value.isprintable()
-
-
 def _is_number_or_none(value: object) -> bool:
     return value is None or is_number(value)
 
@@ -285,13 +279,4 @@ SUMMARY_ENTRIES: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("psnr", "ssim", "psnr_turned", "ssim_turned"), _is_number_or_none),
     "truth": _is_text_or_none,
     **dict.fromkeys(("memory_estimate_gib", "memory_peak_gib"), _is_number_or_none),
-}
-
-# The kinds of the entries of a declaration (``Number``).
-DECLARED: dict[str, Callable[[Any], bool]] = {
-    **dict.fromkeys(("label", "unit", "explained", "replaces", "metric"), _is_label),
-    "digits": lambda value: is_whole(value) and value <= MOST_DIGITS,
-    "is_more_better": lambda value: value is None or isinstance(value, bool),
-    "preference": is_whole,
-    "needs_truth": lambda value: isinstance(value, bool),
 }

@@ -131,7 +131,6 @@ class _Header:
     count: int  # of Gaussians
     degree: int  # of SH
     fractional_bits: int
-    has_extensions: bool
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -153,36 +152,23 @@ def _unzipped(path: Path, content: bytes) -> tuple[_Header, bytes]:
     """Return the header and the bytes of all blocks. Nothing is decompressed beyond what is needed."""
     if content.startswith(MAGIC):
         raise UserError(f"{path}: expected SPZ version 2 or 3, got version 4 or later. Try: {CONVERSION}")
-    if not content.startswith(GZIP_MAGIC):
-        raise unusable(path, f"not an spz file: it begins with {content[:4]!r}")
     inflate = zlib.decompressobj(wbits=31)  # gzip, whose checksum is verified
     start = inflate.decompress(content, HEADER.size)
-    if len(start) < HEADER.size:
-        raise unusable(path, "truncated: the header has no end")
-    header = _parsed(path, start)
+    if len(start) < HEADER.size or not start.startswith(MAGIC):
+        raise unusable(path, "not an spz file")
+    _, version, count, degree, fractional_bits, flags, _ = HEADER.unpack(start)
+    if version not in VERSIONS or degree > MAX_DEGREE:
+        wanted = f"SPZ version 2 or 3 and SH degree 0 to {MAX_DEGREE}"
+        raise unusable(path, f"expected {wanted}, got version {version} and degree {degree}")
+    header = _Header(version, count, degree, fractional_bits)
     if header.packed_bytes + header.unpacked_bytes > MOST_EXPANSION * len(content) + SPARE_BYTES:
-        problem = f"its header promises {header.count:,} Gaussians, too many for {len(content):,} bytes"
-        raise unusable(path, problem)
+        raise unusable(path, f"its header promises {count:,} Gaussians, too many for {len(content):,} bytes")
     # A limit of 0 would be none at all. One byte more shows whether the stream goes on.
     packed = inflate.decompress(inflate.unconsumed_tail, header.packed_bytes + 1)
-    if len(packed) < header.packed_bytes:
-        promised = f"the header promises {header.packed_bytes:,} bytes"
-        raise unusable(path, f"truncated: {promised}, the stream holds {len(packed):,}")
     is_at_end = len(packed) == header.packed_bytes and inflate.eof and not inflate.unused_data
-    if not header.has_extensions and not is_at_end:
-        raise unusable(path, f"the stream does not end after the {header.count:,} Gaussians of its header")
+    if len(packed) < header.packed_bytes or not (is_at_end or flags & HAS_EXTENSIONS):
+        raise unusable(path, f"expected {header.packed_bytes:,} bytes after its header, got another number")
     return header, packed
-
-
-def _parsed(path: Path, start: bytes) -> _Header:
-    magic, version, count, degree, fractional_bits, flags, _ = HEADER.unpack(start)
-    if magic != MAGIC:
-        raise unusable(path, f"not an spz file: the gzip stream begins with {magic!r}")
-    if version not in VERSIONS:
-        raise unusable(path, f"expected SPZ version 2 or 3, got {version}")
-    if degree > MAX_DEGREE:
-        raise unusable(path, f"expected SH degree 0 to {MAX_DEGREE}, got {degree}")
-    return _Header(version, count, degree, fractional_bits, bool(flags & HAS_EXTENSIONS))
 
 
 def _blocks(header: _Header, packed: bytes) -> list[np.ndarray]:

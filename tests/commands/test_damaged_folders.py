@@ -217,7 +217,7 @@ def test_only_damaged_checkpoints_end_the_run_with_one_message(finished, tmp_pat
     for path in Path("run/checkpoints").iterdir():
         path.write_bytes(b"damaged")
     assert ended("train", "resume=run") == 1
-    assert "No other checkpoint there is sound" in capsys.readouterr().err
+    assert "cannot be read as a checkpoint" in capsys.readouterr().err
 
 
 def test_a_run_cannot_resume_beyond_its_last_step(finished, tmp_path, monkeypatch, capsys):

@@ -70,7 +70,7 @@ def test_the_file_does_not_hold_the_whole_storage_of_a_view(tmp_path):
 
 @pytest.mark.parametrize("value", [object(), {1, 2}, {"deep": [object()]}, {object(): 1}])
 def test_what_a_safe_load_would_refuse_is_refused_when_saving(tmp_path, value):
-    with pytest.raises(TypeError):
+    with pytest.raises(ValueError, match="plain"):
         save_checkpoint(tmp_path / "a.pt", {"value": value})
     assert list(tmp_path.iterdir()) == []
 
@@ -106,16 +106,16 @@ def test_a_truncated_file_is_a_user_error(tmp_path, share):
 
 
 def test_a_missing_file_is_a_user_error(tmp_path):
-    with pytest.raises(UserError, match="no such checkpoint"):
+    with pytest.raises(UserError, match="No such file"):
         load_checkpoint(tmp_path / "a.pt")
 
 
 def test_other_torch_files_and_other_versions_are_refused(tmp_path):
     torch.save({"weights": torch.ones(3)}, tmp_path / "other.pt")
-    with pytest.raises(UserError, match="not a cadam3d checkpoint"):
+    with pytest.raises(UserError, match="cannot be read as a checkpoint"):
         load_checkpoint(tmp_path / "other.pt")
     torch.save({"format": checkpoint.FORMAT, "version": 999, "payload": {}}, tmp_path / "new.pt")
-    with pytest.raises(UserError, match="version 999"):
+    with pytest.raises(UserError, match="version"):
         load_checkpoint(tmp_path / "new.pt")
 
 
