@@ -141,7 +141,7 @@ def check_recovered(samples: Tensor) -> None:
 @pytest.mark.parametrize("path", PATHS)
 def test_ode_sampling_recovers_the_distribution(path: NoisePath) -> None:
     """DDIM steps (Euler steps of the velocity on the flow) carry noise to the mixture."""
-    count, generator = 8000, torch.Generator().manual_seed(3)
+    count, generator = 3000, torch.Generator().manual_seed(3)
     times = torch.linspace(1, 0, 151, dtype=torch.float64) ** 2  # finer where the image appears
     mixture = small(count)
     _, a, b = at(path, 1.0, count)
@@ -157,7 +157,7 @@ def test_ode_sampling_recovers_the_distribution(path: NoisePath) -> None:
 @pytest.mark.parametrize("path", PATHS)
 def test_ancestral_sampling_recovers_the_distribution(path: NoisePath) -> None:
     """The sampler of DDPM draws from the posterior q(x_s | x_t, clean), with new noise at each step."""
-    count, generator = 8000, torch.Generator().manual_seed(4)
+    count, generator = 3000, torch.Generator().manual_seed(4)
     times = torch.linspace(1, 0, 301, dtype=torch.float64) ** 2
     mixture = small(count)
     _, a, b = at(path, 1.0, count)

@@ -69,7 +69,7 @@ def test_every_scene_is_seen_from_all_sides_and_never_clipped(prompt: str) -> No
 def test_silhouette_equals_brute_force(prompt: str) -> None:
     """A pixel is covered if and only if one of many points along its ray is inside a solid."""
     parts = assemble(parse(prompt))
-    view = cameras(24, 2).to(torch.float64)
+    view = cameras(16, 2).to(torch.float64)
     layers = trace(compile_scene(parts), view, 1)
     origins, directions = view.rays()
     depths = fitting_distance(40.0) + torch.linspace(-0.9, 0.9, 500, dtype=torch.float64)
