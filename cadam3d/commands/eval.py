@@ -12,14 +12,14 @@ from omegaconf import DictConfig
 
 from cadam3d import report
 from cadam3d.build import component
-from cadam3d.commands.measuring import CHANGED, build_metrics, measure, rebuild_start
+from cadam3d.commands.measuring import build_metrics, measure, rebuild_start
 from cadam3d.commands.opened import find_run, open_run, renderer
 from cadam3d.core.checks import require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.jsonl import write_json
-from cadam3d.io.records import MEASUREMENTS, NUMBERS, Score, psnr_of, read_summary, scores_in, with_earlier
+from cadam3d.io.records import MEASUREMENTS, NUMBERS, psnr_of, read_summary, scores_in, with_earlier
 from cadam3d.io.run_folder import CONFIG, EVALUATION, LATEST, shown, typed_path
 from cadam3d.metric.base import Measurand
 from cadam3d.prior.base import DiffusionPrior
@@ -28,8 +28,6 @@ from cadam3d.settings.compose import Call
 from cadam3d.settings.trust import read_components, require_contained
 from cadam3d.sweep.folder import is_sweep, load
 from cadam3d.sweep.table import aligned, scores_of, write_table
-
-SHORT = 7  # characters of a commit, as git abbreviates it
 
 
 def run(cfg: DictConfig, call: Call) -> None:
@@ -65,12 +63,11 @@ def evaluate(cfg: DictConfig, call: Call, folder: Path) -> dict[str, Any]:
         is_trusted=cfg.trust,
         retry=trusting(call),
     )
-    own = components_of(("prior", "rasterizer", "truth"), optional=("truth",))
+    own = components_of(("prior", "rasterizer", "truth"))
     asset = open_run(folder, cfg.device)
     device = asset.gaussians.device
     prior = component(own.prior, DiffusionPrior, "prior").to(device)
-    node = cfg.get("truth", own.get("truth"))
-    # Runs of earlier versions name none.
+    node = cfg.get("truth", own.truth)
     source = PriorTruth() if node is None else component(node, TruthSource, "truth")
     truth = source.of(own.prompt, prior)
 
@@ -95,44 +92,32 @@ def evaluate(cfg: DictConfig, call: Call, folder: Path) -> dict[str, Any]:
     if warnings:
         result["warnings"] = warnings
     if truth is None:
-        result["note"] = (
-            "this run has no true images, so psnr and ssim are missing. For a prompt of the embedded world, "
-            "add truth=shapes"
-        )
+        result["note"] = "this run has no true images, so psnr and ssim are missing"
     return result
 
 
 def _as_text(result: Mapping[str, Any]) -> str:
     """Return the entries of an ``eval.json``, one line each; those of scores say how they were measured."""
-    scores = scores_in(result)
+    records = result.get(MEASUREMENTS, {})
+    # Metrics that have measured no number say why.
+    missing = {name: "-" for name in records if name not in result}
     lines = []
-    for name, value in result.items():
+    for name, value in {**result, **missing}.items():
         if name not in (MEASUREMENTS, NUMBERS):
             text = f"{value:.4f}" if isinstance(value, float) else str(value)
-            note = f"   {_explained(scores[name])}" if name in scores else ""
-            lines.append(f"{name:<20}{text}{note}")
-    for name, record in result.get(MEASUREMENTS, {}).items():
-        if name not in scores and "reason" in record:
-            lines.append(f"{name:<20}-   {record['reason']}")
+            lines.append(f"{name:<20}{text}   {_explained(records.get(name, {}))}".rstrip())
     return "\n".join(lines)
 
 
-def _explained(score: Score) -> str:
-    """Return the interval of a score, the number of views, the protocol and the model, as far as known."""
-    record = score.record
-    protocol, interval, views = (record.get(key) for key in ("protocol", "interval", "views"))
-    parts = []
-    if isinstance(interval, dict):
+def _explained(record: Mapping[str, Any]) -> str:
+    """Return the interval of a number, its protocol and its model, or why it is missing."""
+    parts = [record["reason"]] if "reason" in record else []
+    if interval := record.get("interval"):
         parts.append(f"{interval['low']:.4f} to {interval['high']:.4f}")
-    if isinstance(views, list):
-        parts.append(f"{len(views)} view{'' if len(views) == 1 else 's'}")
-    if isinstance(protocol, dict):
-        changed = protocol.get(CHANGED)
-        another = f" with another {' and '.join(changed)}" if changed else ""
-        parts.append(f"protocol={protocol.get('name')}{another}")
-    if record.get("model"):
-        revision = str(record.get("revision") or "")[:SHORT]
-        parts.append(f"{record['model']}{'@' if revision else ''}{revision}")
+    if "protocol" in record:
+        parts.append(f"protocol={record['protocol']['name']}")
+    if "model" in record:
+        parts.append(record["model"])
     return ", ".join(parts)
 
 
@@ -165,10 +150,7 @@ def _evaluate_sweep(cfg: DictConfig, call: Call, folder: Path) -> None:
         results.append(with_earlier(measured, job, cfg.metric))
         write_json(job / EVALUATION, results[-1])
     if all("message" in result for result in results):
-        raise UserError(
-            f"run={cfg.run}: no job of this sweep could be measured, and the reasons are above. "
-            "Run the sweep again, after a look at this machine. Try: cadam3d doctor"
-        )
+        raise UserError(f"run: no job of {cfg.run} could be measured, for the reasons above")
     print(_table(results, folder))
     write_json(folder / EVALUATION, results)
     write_table(folder)
@@ -183,10 +165,8 @@ def _table(results: Sequence[Mapping[str, Any]], sweep: Path) -> str:
     scores = scores_of([scores_in(result) for result in results], sweep)
     if not scores.columns and not scores.left_out:
         return ""
-    lines: list[list[Any]] = [["job", *scores.columns]]
-    for index, result in enumerate(results):
-        name = Path(str(result["run"])).name
-        lines.append([name, *(column[index] for column in scores.columns.values())])
+    names = [Path(str(result["run"])).name for result in results]
     known = [[value for value in column if value is not None] for column in scores.columns.values()]
-    lines.append(["mean", *(sum(values) / len(values) for values in known)])
+    means = [sum(values) / len(values) for values in known]
+    lines = [["job", *scores.columns], *zip(names, *scores.columns.values(), strict=True), ["mean", *means]]
     return "\n".join(["", aligned(lines), *scores.left_out])

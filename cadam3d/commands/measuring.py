@@ -14,10 +14,7 @@ from cadam3d.initializer.base import Initializer
 from cadam3d.io.records import MEASUREMENTS, NUMBERS
 from cadam3d.metric.base import Measurand, Metric
 from cadam3d.metric.turn import facing
-from cadam3d.settings.options import option_names, read_option
 from cadam3d.state import start_generators
-
-CHANGED = "changed"  # the entry of a protocol's record that lists what differs from the shipped one
 
 
 def build_metrics(group: Any) -> dict[str, Metric]:
@@ -66,22 +63,7 @@ def measure(
         for number in metric.numbers
         if number.name in numbers
     }
-    return {**numbers, NUMBERS: declarations} | (
-        {MEASUREMENTS: {name: _with_changes(each) for name, each in details.items()}} if details else {}
-    )
-
-
-def _with_changes(record: dict[str, Any]) -> dict[str, Any]:
-    """Return the record of a number with the names of the settings in which its protocol was changed.
-
-    Settings are changed if they differ from the shipped protocol of the same name.
-    """
-    protocol = record.get("protocol")
-    if not isinstance(protocol, dict) or protocol.get("name") not in option_names("protocol"):
-        return record
-    shipped = read_option("protocol", protocol["name"])["protocol"]
-    changed = sorted(key for key, value in protocol.items() if value != shipped.get(key))
-    return record | {"protocol": protocol | ({CHANGED: changed} if changed else {})}
+    return {**numbers, NUMBERS: declarations} | ({MEASUREMENTS: details} if details else {})
 
 
 def rebuild_start(prompt: str, initializer: Initializer, seed: int, device: torch.device) -> Gaussians:

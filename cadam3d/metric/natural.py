@@ -12,16 +12,14 @@ As in basicsr, pictures are processed in single precision. In plain areas, round
 number and zero, and the shapes come from a grid, so the precision is visible in the fourth digit of a result.
 """
 
-import io
 import warnings
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy.ndimage import correlate
 from scipy.special import gamma
-
-from cadam3d.core.errors import UserError
 
 BLOCK = 96  # pixels, at the first scale
 SCALES = 2
@@ -92,29 +90,17 @@ def block_features(
     return np.concatenate(columns, axis=1)
 
 
-def read(content: bytes, where: str, key: str) -> Pristine:
-    """Return the parameters in the bytes of a file such as basicsr's ``niqe_pris_params.npz``.
+def read(file: Path) -> Pristine:
+    """Return the parameters in a file such as basicsr's ``niqe_pris_params.npz``.
 
-    Nothing in the file is executed. Raises ``UserError``, which names ``key`` and ``where``, if the entries
-    are missing or have wrong shapes.
+    Nothing in the file is executed. Raises almost any exception if an entry is missing or damaged.
     """
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            mean, covariance, window = (np.asarray(file[name], dtype=np.float64) for name in KEYS)
-        shapes = (mean.size, covariance.shape, window.ndim)
-        if shapes != (NUM_FEATURES, (NUM_FEATURES, NUM_FEATURES), 2):
-            raise ValueError(f"their shapes are {mean.shape}, {covariance.shape} and {window.shape}")
-        if not all(np.isfinite(values).all() for values in (mean, covariance, window)):
-            raise ValueError("some of their values are not finite")
-    # A damaged file makes its reader raise almost anything.
-    except Exception as error:
-        # NumPy's message recommends running what is in the file.
-        reason = " ".join(str(error).partition("allow_pickle")[0].split())[:120]
-        raise UserError(
-            f"{key}: expected a file with {', '.join(KEYS)}, as basicsr's niqe_pris_params.npz has them, got "
-            f"{where!r} ({reason}). Try: {key}=null"
-        ) from error
-    return Pristine(mean.reshape(-1), covariance, window)
+    with np.load(file, allow_pickle=False) as entries:
+        mean, covariance, window = (np.asarray(entries[name], dtype=np.float64) for name in KEYS)
+    found = Pristine(mean.reshape(NUM_FEATURES), covariance.reshape(NUM_FEATURES, NUM_FEATURES), window)
+    if not all(np.isfinite(values).all() for values in (mean, covariance, window)):
+        raise ValueError("some values are not finite")
+    return found
 
 
 def cropped(image: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "a b"]:

@@ -1,20 +1,19 @@
 """Niqe: how far the statistics of a picture are from those of photographs, without any reference."""
 
-import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_choice
-from cadam3d.core.errors import UserError
+from cadam3d.core.checks import fail, require_choice, require_whole
 from cadam3d.core.number import Number
 from cadam3d.metric import natural
 from cadam3d.metric.base import Measurand, Measurement
 from cadam3d.metric.scoring import ScoreMetric, Scorer
+from cadam3d.metric.transformer import model_facts
 
 OWN_PARAMETERS = Path(__file__).with_name("niqe_parameters.npz")
 # The name of these parameters in the record of a number.
@@ -40,12 +39,6 @@ class Niqe(ScoreMetric):
 
     def __post_init__(self) -> None:
         require_choice("metric.niqe.plain_blocks", self.plain_blocks, PLAIN)
-        require(
-            self.parameters is None or (isinstance(self.parameters, str) and self.parameters.strip() != ""),
-            "metric.niqe.parameters",
-            expected="a file or null",
-            got=self.parameters,
-        )
 
     def prepare(self) -> None:
         """Read the parameters."""
@@ -53,19 +46,15 @@ class Niqe(ScoreMetric):
 
     def scorer(self, device: torch.device) -> Scorer:
         """Return what measures one picture. It computes on the CPU, and ignores the text."""
-        if self.protocol.size < SMALLEST:
-            raise UserError(
-                f"protocol.size: expected at least {SMALLEST} pixels, because niqe compares blocks of "
-                f"{natural.BLOCK} pixels, got {self.protocol.size}. Try: protocol.size=512"
-            )
-        content, name = self._content()
-        pristine = natural.read(content, name, "metric.niqe.parameters")
-        facts = {
-            "model": name,
-            "revision": None,
-            "weights_sha256": hashlib.sha256(content).hexdigest(),
-            "plain_blocks": self.plain_blocks,
-        }
+        require_whole("protocol.size", self.protocol.size, low=SMALLEST)
+        file = OWN_PARAMETERS if self.parameters is None else Path(self.parameters).expanduser()
+        try:
+            pristine = natural.read(file)
+        # A damaged file makes its reader raise almost anything.
+        except Exception as error:
+            expected = "a file such as basicsr's niqe_pris_params.npz"
+            raise fail("metric.niqe.parameters", expected=expected, got=self.parameters) from error
+        facts = {**model_facts(self.parameters or OWN_NAME, None, [file]), "plain_blocks": self.plain_blocks}
         return Scorer(score=lambda images, _text: self._distances(images, pristine), facts=facts)
 
     def measure(self, measurand: Measurand) -> Measurement:
@@ -80,25 +69,13 @@ class Niqe(ScoreMetric):
         values = self.values(measurand, scorer, "")
         known = values[values.isfinite()]
         lost = len(values) - len(known)
-        missing = f"{lost} of {len(values)} views are left out, because they show no texture"
-        warnings = (missing,) if lost else ()
+        missing = (f"{lost} of {len(values)} views are left out, because they show no texture",)
+        warnings = missing if lost else ()
         # A number other than the mean may need every view.
         if len(known) == 0 or (lost and not self.protocol.is_mean):
             return Measurement({}, warnings=warnings)
-        facts: dict[str, Any] = {**scorer.facts, "views_left_out": lost}
+        facts = {**scorer.facts, "views_left_out": lost}
         return replace(self.measurement(known, None, facts), warnings=warnings)
-
-    def _content(self) -> tuple[bytes, str]:
-        """Return the bytes of the parameters and their name."""
-        if self.parameters is None:
-            return OWN_PARAMETERS.read_bytes(), OWN_NAME
-        try:
-            return Path(self.parameters).expanduser().read_bytes(), self.parameters
-        except OSError as error:
-            raise UserError(
-                f"metric.niqe.parameters: expected a file such as basicsr's niqe_pris_params.npz, got "
-                f"{self.parameters!r} ({error.strerror}). Try: metric.niqe.parameters=null"
-            ) from error
 
     def _distances(self, images: Float[Tensor, "v h w 3"], pristine: natural.Pristine) -> Float[Tensor, "v"]:
         keeps = self.plain_blocks == "keep"

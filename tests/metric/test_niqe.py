@@ -53,7 +53,7 @@ def picture(name, size=192):
 
 @pytest.fixture(scope="module")
 def pristine():
-    return natural.read(OWN_PARAMETERS.read_bytes(), "ours", "metric.niqe.parameters")
+    return natural.read(OWN_PARAMETERS)
 
 
 def ours(image, pristine):
@@ -169,21 +169,21 @@ MEAN, COVARIANCE, WINDOW = np.zeros(36), np.eye(36), np.full((7, 7), 1 / 49)
 
 
 @pytest.mark.parametrize(
-    ("entries", "reason"),
+    "entries",
     [
-        ((MEAN,), "cov_pris_param"),
-        ((MEAN[:35], COVARIANCE, WINDOW), "shapes"),
-        ((MEAN, COVARIANCE * np.nan, WINDOW), "finite"),
-        ((np.array([{}] * 36), COVARIANCE, WINDOW), "Object arrays cannot be loaded"),
+        (MEAN,),
+        (MEAN[:35], COVARIANCE, WINDOW),
+        (MEAN, COVARIANCE * np.nan, WINDOW),
+        (np.array([{}] * 36), COVARIANCE, WINDOW),
     ],
 )
-def test_files_without_the_right_entries_are_refused(tmp_path, entries, reason):
+def test_files_without_the_right_entries_are_refused(tmp_path, entries):
     file = tmp_path / "other.npz"
     np.savez(file, **dict(zip(natural.KEYS, entries, strict=False)))
-    with pytest.raises(UserError, match=f"{reason}"):
+    with pytest.raises(UserError, match=r"metric\.niqe\.parameters: expected a file"):
         metric(parameters=str(file)).scorer(torch.device("cpu"))
 
 
 def test_small_views_are_refused():
-    with pytest.raises(UserError, match=r"at least 192 pixels.*Try: protocol.size=512"):
+    with pytest.raises(UserError, match=r"protocol\.size: expected a whole number >= 192"):
         metric(size=128).scorer(torch.device("cpu"))
