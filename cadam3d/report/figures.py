@@ -3,7 +3,6 @@
 There is one panel per noise level, and an arm has the same colour and marker everywhere.
 """
 
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -60,15 +59,12 @@ def frontier_figure(results: Sequence[JobResult], quality: Number | None = None)
         axes.margins(x=0.1, y=0.14)
 
     style = looks(result.arm for result in results)
-    figure = _panels(results, draw, "Gaussians at the end", _title(quality, gains), 3.5)
+    title = f"{quality.heading}, gain over no growth" if gains else quality.heading
+    figure = _panels(results, draw, "Gaussians at the end", title, 3.5)
     keys = {result.arm: [key for key, _ in result.setting.thresholds] for result in measured(results)}
     names = {arm: f"{arm}: {', '.join(found)}" if found else arm for arm, found in keys.items()}
     _add_legend(figure, names, style)
     return figure
-
-
-def _title(quality: Number, is_gain: bool) -> str:
-    return f"{quality.heading}, gain over no growth" if is_gain else quality.heading
 
 
 def _panels(
@@ -170,17 +166,12 @@ def thresholds_figure(results: Sequence[JobResult]) -> Figure | None:
     arm, quality = arm_of_two_thresholds(results), next(iter(qualities(results)), None)
     if arm is None or quality is None:
         return None
-    is_gain = bool(arms_without_growth(results))
-    rows = [(level, at_noise(results, level)) for level in levels_of(results)]
-    found = {level: frontier(here, arm, gain_over(here, value_of(quality))) for level, here in rows}
-    found = {level: points for level, points in found.items() if points}
-    figure = new_figure(2, len(found), width=8.2, height=2.7)
-    panels = figure.subplots(len(found), 2, squeeze=False)
-    for (left, right), (level, points) in zip(panels, found.items(), strict=True):
-        left.set_title(f"Gaussians, {level_title(level)}".removesuffix(", "))
-        _draw_heat(left, points, lambda point: math.log10(point.count.median), lambda x: f"{10**x:,.0f}")
-        right.set_title(f"{_title(quality, is_gain)}, {level_title(level)}".removesuffix(", "))
-        _draw_heat(right, points, lambda point: point.gain.median, lambda x: f"{x:.{quality.digits}f}")
+    levels = levels_of(results)
+    figure = new_figure(len(levels), width=4.6 * len(levels), height=3.4)
+    for axes, level in zip(figure.subplots(1, len(levels), squeeze=False)[0], levels, strict=True):
+        if points := frontier(at_noise(results, level), arm, value_of(quality)):
+            _draw_heat(axes, points, quality)
+        axes.set_title(f"Gaussians and {quality.heading}, {level_title(level)}".removesuffix(", "))
     return figure
 
 
@@ -192,25 +183,25 @@ def arm_of_two_thresholds(results: Sequence[JobResult]) -> str | None:
     return None
 
 
-def _draw_heat(
-    axes: Axes,
-    points: Sequence[FrontierPoint],
-    value: Callable[[FrontierPoint], float],
-    text: Callable[[float], str],
-) -> None:
-    """Draw a value of each setting as a colour and as text, over the two thresholds."""
+def _draw_heat(axes: Axes, points: Sequence[FrontierPoint], quality: Number) -> None:
+    """Draw the quality of each setting as a colour, and its count and quality as text."""
     names, places = zip(*(zip(*point.setting.thresholds, strict=True) for point in points), strict=True)
     across, down = (sorted(set(values)) for values in zip(*places, strict=True))
     table = np.full((len(down), len(across)), np.nan)
     for point, (x, y) in zip(points, places, strict=True):
-        table[down.index(y), across.index(x)] = value(point)
-    axes.imshow(table, cmap="viridis", origin="lower", aspect="auto", interpolation="nearest")
-    middle = (np.nanmin(table) + np.nanmax(table)) / 2
-    for point, (x, y) in zip(points, places, strict=True):
-        weight = "bold" if point.is_standard else "normal"
-        style = {"ha": "center", "va": "center", "fontsize": 8.5, "weight": weight}
-        color = "#fefefe" if value(point) < middle else "#111111"
-        axes.text(across.index(x), down.index(y), text(value(point)), color=color, **style)
+        table[down.index(y), across.index(x)] = point.gain.median
+        text = f"{point.count.median:,.0f}\n{point.gain.median:.{quality.digits}f}"
+        axes.text(
+            across.index(x),
+            down.index(y),
+            text,
+            ha="center",
+            va="center",
+            fontsize=8.5,
+            weight="bold" if point.is_standard else "normal",
+            color="#111111",
+        )
+    axes.imshow(table, cmap="summer", origin="lower", aspect="auto", alpha=0.6)
     axes.set_xticks(range(len(across)), [f"{each:g}" for each in across])
     axes.set_yticks(range(len(down)), [f"{each:g}" for each in down])
     axes.set_xlabel(names[0][0])

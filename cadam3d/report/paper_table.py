@@ -219,8 +219,6 @@ def _notes(results: Sequence[JobResult], usable: Sequence[JobResult], numbers: S
     methods = [score.method for job in usable for name, score in job.scores.items() if name in names]
     if protocols := {method["protocol.name"] for method in methods if "protocol.name" in method}:
         notes.append(f"Learned scores: protocol={', '.join(protocols)}, as eval.json of each job records it.")
-    if lacking := len(results) - len(usable):
-        notes.append(f"{lacking} of {len(results)} jobs left nothing to measure or did not end yet.")
     if early := sum(result.ended_early for result in usable):
         notes.append(f"{early} of {len(results)} jobs ended early, with unfinished assets.")
     return notes

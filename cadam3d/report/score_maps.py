@@ -18,7 +18,6 @@ from cadam3d.report.compare import by_cell, main_setting
 from cadam3d.report.results import JobResult, arms_of, at_noise, histograms, level_title, levels_of, measured
 from cadam3d.report.style import label_axis, new_figure
 
-MAX_COLUMNS = 3  # maps in one line
 LEAST_SHARE = 0.002  # of the Gaussians; emptier bins do not widen the axis
 # The map is light on dark pages too, so that darker always means more. None of these colours may be one that
 # palette.py replaces on dark pages.
@@ -77,28 +76,26 @@ def score_figure(results: Sequence[JobResult], chart: Chart) -> Figure | None:
 
     Arms whose jobs have no such score are left out. ``None`` if none has.
     """
-    maps: dict[str, ScoreMap] = {}
+    levels, maps = levels_of(results), defaultdict(dict)
     for arm in arms_of(results):
-        for level in levels_of(results):
+        for level in levels:
             members = by_cell(at_noise(results, level), main_setting(results, arm))
             if found := ScoreMap.of(list(members.values()), chart.score):
-                maps[f"{arm}, {level_title(level)}".removesuffix(", ")] = found
+                maps[arm][level] = found
     if not maps:
         return None
-    columns = min(len(maps), MAX_COLUMNS)
-    lines = -(-len(maps) // columns)
-    figure = new_figure(columns, lines, height=2.7 if lines < 4 else 2.1)
-    panels = figure.subplots(lines, columns, squeeze=False, sharey=True)
-    for axes, (title, found) in zip(panels.flat, maps.items(), strict=False):
-        axes.set_title(title)
-        _draw(axes, found)
-    shown = [value for found in maps.values() for value in found.shown]
+    figure = new_figure(max(len(levels), 2), len(maps), height=2.4)
+    panels = figure.subplots(len(maps), len(levels), squeeze=False, sharex=True, sharey=True)
+    for line, (arm, found) in zip(panels, maps.items(), strict=True):
+        for axes, level in zip(line, levels, strict=True):
+            axes.set_title(f"{arm}, {level_title(level)}".removesuffix(", "))
+            if level in found:
+                _draw(axes, found[level])
+    shown = [value for found in maps.values() for each in found.values() for value in each.shown]
     panels[0, 0].set_ylim(min(shown) / 1.5, max(shown) * 2)
     label_axis(panels[0, 0].yaxis)
-    figure.supxlabel("step")
-    figure.supylabel(chart.score)
-    for axes in panels.flat[len(maps) :]:
-        axes.set_visible(False)
+    figure.supxlabel("step", fontsize=9)
+    figure.supylabel(chart.score, fontsize=9)
     return figure
 
 

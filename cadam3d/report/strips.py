@@ -56,33 +56,20 @@ def _mask(result: JobResult, step: int) -> ShownPicture:
     return mask_of(read_png(path)), f"step {step}", text
 
 
-def ablation_figure(results: Sequence[JobResult]) -> Figure | None:
-    """Show one strip per arm in one cell: views of the asset, its count, quality and outcome (fig. 7)."""
-    members = main_results([result for result in results if has_views(result)])
-    if len(members) < 2:
-        return None
-    lines = {
-        result.arm: [(view, "", _facts(result) if i == 0 else "") for i, view in enumerate(views(result))]
-        for result in members
-    }
-    return _draw(lines, results, members[0].cell)
-
-
-def objectives_figure(results: Sequence[JobResult]) -> Figure | None:
-    """Show one cell with a line per objective and a column per arm (paper fig. 4)."""
+def assets_figure(results: Sequence[JobResult]) -> Figure | None:
+    """Show the assets of one cell: a line per objective, a column per arm (paper fig. 4 and 7)."""
     axis = objective_axis(results)
-    shown = [result for result in measured(results) if result.cell[axis] and has_views(result)]
-    objectives = sorted({result.cell[axis] for result in shown})
-    if len(objectives) < 2:
+    shown = [result for result in measured(results) if (result.folder / PREVIEW).is_file()]
+    arms = arms_of(shown)[:MAX_COLUMNS]
+    if len({(result.cell[axis], result.arm) for result in shown}) < 2:
         return None
     cell = main_results(shown)[0].cell.without(axis)
     lines = {}
-    for objective in objectives:
+    for objective in sorted({result.cell[axis] for result in shown}):
         own = [each for each in shown if (each.cell[axis], each.cell.without(axis)) == (objective, cell)]
         members = {result.arm: result for result in main_results(own)}
         lines[objective] = [
-            (views(members[arm])[0], arm, _facts(members[arm])) if arm in members else None
-            for arm in arms_of(shown)
+            (first_view(members[arm]), arm, _facts(members[arm])) if arm in members else None for arm in arms
         ]
     return _draw(lines, results, cell)
 
@@ -107,18 +94,12 @@ def candidate_pictures(result: JobResult) -> dict[int, Path]:
     return dict(step_pictures(result.folder / CANDIDATES))
 
 
-def has_views(result: JobResult) -> bool:
-    """Return whether the job left pictures of its asset."""
-    return (result.folder / PREVIEW).is_file()
-
-
-def views(result: JobResult) -> list[np.ndarray]:
-    """Return the single pictures in the first line of ``preview.png``, which must exist."""
+def first_view(result: JobResult) -> np.ndarray:
+    """Return the first picture of ``preview.png``, which must exist."""
     sheet, path = read_png(result.folder / PREVIEW), result.folder / CONFIG
     size = dict(flatten(read_config(path))).get("exporter.preview.size") if path.is_file() else None
-    if type(size) is not int or not 0 < size <= min(sheet.shape[:2]):
-        size = min(sheet.shape[:2])
-    return [sheet[:size, left : left + size] for left in range(0, sheet.shape[1] - size + 1, size)]
+    size = size if type(size) is int and size > 0 else min(sheet.shape[:2])
+    return sheet[:size, :size]
 
 
 def mask_of(picture: np.ndarray) -> np.ndarray:
@@ -137,7 +118,7 @@ def _facts(result: JobResult) -> str:
 
 def _draw(lines: Mapping[str, Sequence[ShownPicture]], results: Sequence[JobResult], cell: Cell) -> Figure:
     """Draw lines of pictures with their titles on the left, and the name of the cell above all."""
-    columns = min(max(map(len, lines.values())), MAX_COLUMNS)
+    columns = max(map(len, lines.values()))
     figure = new_figure(columns, len(lines), width=PICTURE_INCH * columns + 0.4, height=PICTURE_INCH * 1.25)
     panels = figure.subplots(len(lines), columns, squeeze=False)
     colors = {arm: look.color for arm, look in looks(result.arm for result in results).items()}
@@ -145,9 +126,7 @@ def _draw(lines: Mapping[str, Sequence[ShownPicture]], results: Sequence[JobResu
         row[0].set_ylabel(name.replace("_", "\n"), fontsize=8.5, weight="bold", color=colors.get(name, SOFT))
         for axes in row:
             hide_axes(axes)
-        for axes, (image, above, below) in (
-            (row[i], each) for i, each in enumerate(pictures[:columns]) if each
-        ):
+        for axes, (image, above, below) in ((row[i], each) for i, each in enumerate(pictures) if each):
             axes.imshow(image, interpolation="antialiased")
             axes.set_xlabel(below, fontsize=7.5, color=SOFT, labelpad=2)
             axes.set_title(above, fontsize=8.5, weight="normal", loc="center", color=colors.get(above, INK))

@@ -62,15 +62,11 @@ KINDS = {
         "How the count and the quality depend on two thresholds of one arm. Medians over cells; the standard "
         "setting is bold.",
     ),
-    "ablation": FigureKind(
-        strips.ablation_figure,
+    "assets": FigureKind(
+        strips.assets_figure,
         "Arms side by side",
-        "The same scene from the same start; only the arm differs.",
-    ),
-    "objectives": FigureKind(
-        strips.objectives_figure,
-        "Objectives and arms",
-        "One scene under each objective (lines) and arm (columns), with its final count and quality.",
+        "One scene from the same start, with the final count and quality; only the arm differs, and the "
+        "objective where the sweep varies it.",
     ),
 }
 MOST_PROMPTS = 3  # in the title of a page

