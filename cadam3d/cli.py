@@ -66,7 +66,10 @@ def dispatch(words: Sequence[str]) -> int:
     if words[0] in COMPLETION_FLAGS:
         return complete(words)
     if words[0] not in COMMANDS:
-        raise unknown_command(words)
+        from cadam3d.core.checks import fail, nearest
+
+        example = f"cadam3d {nearest(words[0], COMMANDS) or '--help'}"
+        raise fail("command", expected=f"one of {'|'.join(COMMANDS)}", got=words[0], example=example)
     from cadam3d.launch import launch
 
     return launch(words[0], words[1:])
@@ -86,21 +89,6 @@ def help_text() -> str:
         'Tab completion (bash):  eval "$(cadam3d -sc install=bash)"',
     ]
     return "\n".join(lines)
-
-
-def unknown_command(words: Sequence[str]) -> UserError:
-    """Return the error for an unknown command, with the nearest one or with the line for a bare prompt."""
-    from cadam3d.settings.advice import did_you_mean
-
-    first, near = words[0], did_you_mean(words[0], list(COMMANDS))
-    if near:
-        line = shlex.join(["cadam3d", near[0], *words[1:]])
-        return UserError(f"{first!r} is not a command. Did you mean {near[0]}? Try: {line}")
-    prompt = " ".join(word for word in words if "=" not in word)
-    settings = [word for word in words if "=" in word]
-    line = shlex.join(["cadam3d", "train", *([f"prompt={prompt}"] if prompt else []), *settings])
-    line = "cadam3d --help" if first.startswith("-") else line
-    return UserError(f"{first!r} is not a command: expected one of {'|'.join(COMMANDS)}. Try: {line}")
 
 
 def complete(words: Sequence[str]) -> int:
@@ -130,7 +118,7 @@ def complete(words: Sequence[str]) -> int:
         *done, last = [*typed[1:], ""] if is_new_word else typed[1:]
         plain = [word for word in done if " " not in word and not word.startswith(("prompt=", "negative_"))]
         os.environ["COMP_LINE"] = " ".join(["cadam3d", *plain, last])
-    from cadam3d.settings.hydra import run_hydra
+    from cadam3d.settings.compose import run_hydra
 
     command = typed[0] if action == "query" else "train"
     # A line that is wrong so far has no completions.

@@ -1,7 +1,6 @@
 """Launch: read a command line, refuse one that cannot work before any work starts, and run its command."""
 
 import gc
-import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -10,13 +9,13 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import JOBS, RUN_FOLDER, expanded, has_file, typed_path
-from cadam3d.settings.advice import explain, line_of, refused_path, require_values, reraise_interrupt
-from cadam3d.settings.check import require_settings
-from cadam3d.settings.compose import LONGEST_KEY, TEXT_KEYS, Call, compose_line
+from cadam3d.settings.advice import explain, line_of, refused_path, reraise_interrupt
+from cadam3d.settings.check import require_effective, require_settings
+from cadam3d.settings.compose import Call, compose_line, run_hydra
 from cadam3d.settings.help import help_text
-from cadam3d.settings.hydra import refuse_missing_settings, refuse_unread_settings, run_hydra
 from cadam3d.settings.line import (
     DRY_RUN,
     HYDRA_KEYS,
@@ -74,19 +73,13 @@ def prepare(command: str, words: Sequence[str]) -> tuple[DictConfig, Call]:
     """
     with explaining(command, words):
         line = read_line(command, words)
-        shell = shlex.join(["cadam3d", command, *words])
+        shell = f"in a shell: {line_of(command, words)}"
         if line.is_sweep or line.wants_page:
-            raise UserError(
-                f"{' '.join(line.flags) or command}: expected the settings of one run, got a line that only "
-                f"the command line can run. Try, in a shell: {shell}"
-            )
+            raise fail(command, expected="a single run without a page", got=line.words, example=shell)
         _refuse_sweeps(line)
         cfg = _composed(line)
         if cfg.get("attempts", 1) > 1:
-            raise UserError(
-                f"attempts: expected 1, got {cfg.attempts}. Attempts are processes, which only the command "
-                f"line starts. Try, in a shell: {shell}"
-            )
+            raise fail("attempts", expected="1 in Python", got=cfg.attempts, example=shell)
         return cfg, _call(line, cfg)
 
 
@@ -98,7 +91,7 @@ def completing(words: Sequence[str]) -> Iterator[None]:
     except UserError as error:
         raise with_example(error) from error.__cause__
     except OSError as error:
-        if advice := refused_path(error, words):
+        if advice := refused_path(error):
             raise advice from error
         raise
 
@@ -170,9 +163,7 @@ def _composed(line: Line) -> DictConfig:
     Raises ``UserError`` and Hydra's exceptions.
     """
     cfg = compose_line(line.command, line.overrides, line.options)
-    require_values(cfg)
-    refuse_missing_settings(cfg, line.command, line.overrides)
-    refuse_unread_settings(cfg, line.command, line.overrides)
+    require_effective(cfg, line.command, line.overrides)
     require_settings(cfg)
     _refuse_several_runs(cfg, line)
     if line.command == "train":
@@ -210,10 +201,7 @@ def _refuse_sweeps(line: Line) -> None:
     """Refuse a setting of sweeps in a line that trains a single run."""
     own = [word for word in line.words if _is_of_sweeps(word)]
     if line.command == "train" and own:
-        page = line_of("train", [*(word for word in line.words if word not in own), "--cfg", "job"])
-        raise UserError(
-            f"{key_of(own[0])}: expected a sweep or several attempts, got a single run. Try: {page}"
-        )
+        raise fail(key_of(own[0]), expected="a sweep or several attempts", got=own[0], example="attempts=2")
 
 
 def _refuse_words(line: Line) -> None:
@@ -222,38 +210,19 @@ def _refuse_words(line: Line) -> None:
     for word in line.words:
         key = key_of(word)
         if "=" not in word and not word.startswith("~"):
-            raise _bare_word(line, word)
-        if len(key) > LONGEST_KEY:
-            expected = f"a key of at most {LONGEST_KEY} characters"
-            raise UserError(
-                f"{key[:40]}...: expected {expected}, got {len(key)} of them. Try: cadam3d {command} --help"
-            )
+            expected = "key=value, in quotes if it has spaces"
+            raise fail(repr(word), expected=expected, got=word, example=f"cadam3d {command} --help")
         if key.partition(".")[0].partition("/")[0] == "hydra" and not HYDRA_KEYS.match(key):
             raise UserError(f"{key}: cadam3d has no such setting of Hydra. Try: {RUN_FOLDER}=outputs/mine")
     if line.is_sweep and command not in TRAINING:
-        kept = [override for override in line.words if override != "hydra.mode=MULTIRUN"]
-        raise UserError(f"{command}: only training can be swept. Try: {line_of(command, kept)}")
-
-
-def _bare_word(line: Line, word: str) -> UserError:
-    """Return the error for a word without ``=``, as an unquoted prompt leaves it."""
-    if line.command not in TRAINING:
-        return UserError(f"{word!r}: expected key=value. Try: cadam3d {line.command} --help")
-    texts = [each for each in line.words if "=" not in each or key_of(each) in TEXT_KEYS[:1]]
-    prompt = " ".join(text.removeprefix("prompt=") for text in texts)
-    typed = line_of(line.command, [f"prompt={prompt}"])
-    return UserError(f"{word!r}: expected key=value. Try: {typed}")
+        raise UserError(f"{command}: only training can be swept. Try: cadam3d {command} --help")
 
 
 def _refuse_several_runs(cfg: DictConfig, line: Line) -> None:
     """Raise ``UserError`` if a line names several runs and its command does not compare them."""
     runs = cfg.get("run")
     if line.command != COMPARING and OmegaConf.is_list(runs):
-        typed = f"run=[{','.join(map(str, runs))}]"
-        raise UserError(
-            f"run: expected one run, got a list of {len(runs)}, which only cadam3d {COMPARING} compares. "
-            f"Try: {shlex.join(['cadam3d', COMPARING, typed])}"
-        )
+        raise fail("run", expected="one run", got=[*runs], example=f"run={runs[0]}")
 
 
 def _refuse_resumed_jobs(overrides: Sequence[str]) -> None:
@@ -264,9 +233,5 @@ def _refuse_resumed_jobs(overrides: Sequence[str]) -> None:
     from cadam3d.sweep.folder import read_plan
 
     plan = read_plan(folder)
-    line = shlex.join(["cadam3d", plan.command, *plan.line]) if plan.line else "cadam3d sweep --help"
-    noun = "attempts at a run" if plan.command == "train" else "jobs of a sweep"
-    raise UserError(
-        f"resume: expected the folder of a run, got {texts[-1]!r}, which has {len(plan.jobs)} {noun}. "
-        f"The line that started them continues them. Try: {line}"
-    )
+    line = line_of(plan.command, plan.line)
+    raise fail("resume", expected="the folder of a run, not of several", got=texts[-1], example=line)

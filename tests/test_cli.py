@@ -24,8 +24,8 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.occupied import occupied
 from cadam3d.io.run_folder import OVERRIDES, claim
 from cadam3d.launch import launch
-from cadam3d.settings import advice, hydra, options
 from cadam3d.settings import compose as settings
+from cadam3d.settings import options
 from cadam3d.settings.line import PATH_KEYS, quoted, resumed, split, text_of
 from cadam3d.trainer import Trainer
 
@@ -100,7 +100,7 @@ class Jobs(list):
 @pytest.fixture
 def jobs(monkeypatch, small_configs) -> Jobs:
     """Replace training: record the configuration, claim the folder, and write a summary."""
-    for module in (settings, hydra, advice):
+    for module in (settings, options):
         monkeypatch.setattr(module, "config_dir", lambda: small_configs)
     seen = Jobs()
 

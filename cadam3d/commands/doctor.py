@@ -104,12 +104,8 @@ def _torchvision() -> Finding:
     if code == 0:
         return Finding("torchvision", Verdict.OK, version)
     reason = output.strip().splitlines()[-1] if output.strip() else "does not import"
-    return Finding(
-        "torchvision",
-        Verdict.BROKEN,
-        f"{version} does not fit torch: {reason}",
-        "Try: pip uninstall torchvision",
-    )
+    found = f"{version} does not fit torch: {reason}"
+    return Finding("torchvision", Verdict.BROKEN, found, "Try: pip uninstall torchvision")
 
 
 def _device() -> Finding:
@@ -123,9 +119,8 @@ def _device() -> Finding:
         )
     found = f"CPU, {torch.get_num_threads()} threads"
     if shutil.which("nvidia-smi") and _run_program(["nvidia-smi", "-L"])[0] == 0:
-        built = f"torch is built for CUDA {torch.version.cuda}" if torch.version.cuda else "torch is CPU-only"
         hint = "Try: pip install --force-reinstall torch, with the CUDA version of your driver"
-        return Finding("device", Verdict.NOTE, f"{found}; there is a GPU, but {built}", hint)
+        return Finding("device", Verdict.NOTE, f"{found}; torch cannot use the GPU", hint)
     return Finding("device", Verdict.OK, found)
 
 

@@ -1,8 +1,7 @@
 """Kernels for ``cadam3d doctor``: how each rasterizer and the ray tracer was compiled, and its self-test."""
 
-import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 
@@ -33,6 +32,7 @@ PROMPT = "a red mug next to a tree"
 TOLERANCE = 1e-4  # of the light, in [0, 1]
 # Failures that do not end a training, because auto chooses another backend then.
 REPLACED = ("rasterizer=cuda", "rasterizer=gsplat")
+REPORT = "Please report this. Until it is fixed, use {}"
 
 
 def check_kernels() -> Iterator[Finding]:
@@ -69,35 +69,25 @@ def _compiled(
 
 def _cpu_kernels() -> Finding:
     built = library.build(cpu_library(), kernels_dir(None))
-    found, facts = _native(instruction_set(library.load(built)), built)
-    return Finding("kernels for cpu", Verdict.OK, found, facts=facts)
+    return Finding("kernels for cpu", Verdict.OK, _native(instruction_set(library.load(built)), built))
 
 
 def _cuda_kernels(device: torch.device) -> Finding:
     name, capability = torch.cuda.get_device_name(device), torch.cuda.get_device_capability(device)
     built, compiler = nvrtc.build(kernels_dir(None), capability), nvrtc.find_compiler()
     assert compiler is not None, "build() has just used it"
-    facts = {
-        "device": name,
-        "compute_capability": ".".join(map(str, capability)),
-        "architecture": f"sm_{nvrtc.choose_architecture(capability, compiler)}",
-        **_nvrtc(compiler),
-        **kept(built),
-    }
     found = (
-        f"{facts['architecture']} for {name} (compute capability {facts['compute_capability']}) "
-        f"by NVRTC {facts['nvrtc_version']} in {compiler.path}, {when(built)}"
+        f"sm_{nvrtc.choose_architecture(capability, compiler)} for {name} "
+        f"(compute capability {dotted(capability)}) by NVRTC {dotted(compiler.version)} "
+        f"in {compiler.path}, {when(built)}"
     )
-    return Finding("kernels for cuda", Verdict.OK, found, facts=facts)
+    return Finding("kernels for cuda", Verdict.OK, found)
 
 
 def _no_cuda() -> Finding:
     compiler = nvrtc.find_compiler()
-    if compiler is None:
-        return Finding("kernels for cuda", Verdict.NOTE, "torch sees no CUDA device; no NVRTC was found")
-    facts = _nvrtc(compiler)
-    found = f"torch sees no CUDA device; NVRTC {facts['nvrtc_version']} is in {compiler.path}"
-    return Finding("kernels for cuda", Verdict.NOTE, found, facts=facts)
+    known = f"NVRTC {dotted(compiler.version)} is in {compiler.path}" if compiler else "no NVRTC was found"
+    return Finding("kernels for cuda", Verdict.NOTE, f"torch sees no CUDA device; {known}")
 
 
 def _gsplat_without_gpu() -> Finding:
@@ -110,10 +100,8 @@ def _gsplat_kernels(device: torch.device) -> Finding:
     start = time.perf_counter()
     GsplatRasterizer().prepare(device)
     seconds = time.perf_counter() - start
-    installed, name = _gsplat_version(), torch.cuda.get_device_name(device)
-    facts = {"device": name, "version": installed, "load_seconds": seconds}
-    found = f"gsplat {installed} for {name}, loaded in {seconds:.1f} s"
-    return Finding("kernels for gsplat", Verdict.OK, found, facts=facts)
+    found = f"gsplat {_gsplat_version()} for {torch.cuda.get_device_name(device)}, loaded in {seconds:.1f} s"
+    return Finding("kernels for gsplat", Verdict.OK, found)
 
 
 def _gsplat_version() -> str | None:
@@ -128,79 +116,53 @@ def _tested(topic: str, rasterizer: Rasterizer, device: torch.device, demands: D
 
 
 def _test(topic: str, rasterizer: Rasterizer, device: torch.device, demands: Demands) -> Finding:
-    start = time.perf_counter()
     agreement = self_test(rasterizer, device, demands)
-    facts = {
-        "device": str(device),
-        "agrees": agreement.holds,
-        "same_bits": agreement.repeats,
-        "images": _as_json(agreement.images),
-        "gradients": _as_json(agreement.gradients),
-        "seconds": time.perf_counter() - start,
-    }
     found = f"{agreement}, on {device}"
     if agreement.passes:
-        return Finding(topic, Verdict.OK, found, facts=facts)
+        return Finding(topic, Verdict.OK, found)
     verdict = Verdict.NOTE if topic in REPLACED else Verdict.BROKEN
-    return Finding(
-        topic, verdict, found, "Please report this. Until it is fixed, use rasterizer=reference", facts
-    )
+    return Finding(topic, verdict, found, REPORT.format("rasterizer=reference"))
 
 
 def _choice(device: torch.device) -> Finding:
     backend = AutoRasterizer().prepare(device)
-    facts = {"device": str(device), "backend": backend.name, "reason": backend.reason}
+    chosen = f"chooses {backend.name} on {device}"
     if backend.reason is None:
-        found = f"chooses {backend.name} on {device}: the fastest there is, and it works"
-        return Finding("rasterizer=auto", Verdict.OK, found, facts=facts)
+        return Finding("rasterizer=auto", Verdict.OK, f"{chosen}: the fastest there is, and it works")
     first, *others = backend.reason.splitlines()
-    found = f"chooses {backend.name} on {device}{backend.remark}: {first}"
-    return Finding("rasterizer=auto", Verdict.NOTE, found, others[-1] if others else "", facts)
+    return Finding("rasterizer=auto", Verdict.NOTE, f"{chosen}{backend.remark}: {first}", *others[-1:])
 
 
 def _tracer() -> Finding:
     """Compile the native tracer and compare it with the one in torch; a note if it cannot be compiled."""
     try:
-        built, library = load_tracer()
+        built, tracer = load_tracer()
     except UserError as error:
         first, *others = str(error).splitlines()
-        found = f"torch, which is slow: {first}"
-        return Finding(TRACER, Verdict.NOTE, found, others[-1] if others else "", {"tracer": "torch"})
+        return Finding(TRACER, Verdict.NOTE, f"torch, which is slow: {first}", *others[-1:])
     scene = scene_of(PROMPT).to(CPU, torch.float32)
     views = turntable(2, elevation_deg=20.0, distance=3.0, fov_y_deg=40.0, size=32)
-    ours, expected = trace_natively(library, scene, views, 2), trace(scene, views, 2)
+    ours, expected = trace_natively(tracer, scene, views, 2), trace(scene, views, 2)
     difference = float((ours.paints - expected.paints).abs().max())
-    how, facts = _native(native_tracer.instruction_set(library), built)
-    facts |= {"tracer": "native", "difference": difference}
+    how = _native(native_tracer.instruction_set(tracer), built)
     if difference <= TOLERANCE:
-        return Finding(TRACER, Verdict.OK, f"native, {how}; equals torch to {difference:.1g}", facts=facts)
-    hint = "Please report this. Until it is fixed, use prior.tracer=torch"
-    return Finding(TRACER, Verdict.BROKEN, f"native, {how}; differs by {difference:.1g}", hint, facts)
+        return Finding(TRACER, Verdict.OK, f"native, {how}; equals torch to {difference:.1g}")
+    hint = REPORT.format("prior.tracer=torch")
+    return Finding(TRACER, Verdict.BROKEN, f"native, {how}; differs by {difference:.1g}", hint)
 
 
-def _native(instructions: str, built: library.Build) -> tuple[str, dict[str, object]]:
-    """Return how kernels for the CPU were compiled, in words and as JSON values."""
+def _native(instructions: str, built: library.Build) -> str:
+    """Return how kernels for the CPU were compiled."""
     compiler = library.find_compiler()
-    version = compiler.version if compiler else None
-    facts = {"compiler": version, "instruction_set": instructions, **kept(built)}
-    return f"{instructions} by {version or 'a compiler that was removed'}, {when(built)}", facts
-
-
-def kept(built: library.Build | nvrtc.Cubin) -> dict[str, object]:
-    """Return where a compiled file is and whether it was compiled now, as JSON values."""
-    return {"path": str(built.path), "compiled_now": built.seconds > 0, "compile_seconds": built.seconds}
+    return f"{instructions} by {compiler.version if compiler else 'another compiler'}, {when(built)}"
 
 
 def when(built: library.Build | nvrtc.Cubin) -> str:
-    """Return where a compiled file is and whether it was compiled now, in words."""
+    """Return where a compiled file is and whether it was compiled now."""
     how = f"compiled now in {built.seconds:.1f} s, kept in" if built.seconds else "from the cache in"
     return f"{how} {built.path.parent}"
 
 
-def _nvrtc(compiler: nvrtc.Nvrtc) -> dict[str, object]:
-    return {"nvrtc": compiler.path, "nvrtc_version": ".".join(map(str, compiler.version))}
-
-
-def _as_json(deviations: Mapping[str, float]) -> dict[str, float | None]:
-    # The deviation of values that are not finite is infinite, and JSON has no infinity.
-    return {name: value if math.isfinite(value) else None for name, value in deviations.items()}
+def dotted(version: Sequence[int]) -> str:
+    """Return a version as text, such as ``12.4``."""
+    return ".".join(map(str, version))

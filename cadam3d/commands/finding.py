@@ -1,7 +1,7 @@
 """Finding: one line of the report of ``cadam3d doctor``."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from enum import StrEnum
 
 from cadam3d.core.errors import UserError
@@ -23,7 +23,6 @@ class Finding:
     verdict: Verdict
     found: str
     hint: str = ""  # what to type; empty if nothing is wrong
-    facts: Mapping[str, object] = field(default_factory=dict)  # JSON values, for programs
 
 
 def attempt(topic: str, check: Callable[[], Finding], *, is_needed: bool = False) -> Finding:

@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TypeGuard
 
 from cadam3d.core.errors import UserError
@@ -76,16 +76,19 @@ def require_choice(key: str, value: object, choices: Sequence[object]) -> None:
     """
     # The types are compared too, because True == 1 == 1.0.
     if not any(type(value) is type(choice) and value == choice for choice in choices):
-        listed = "|".join(_written(choice) for choice in choices)
-        example = f"{key}={_nearest(value, choices)}"
-        raise fail(key, expected=f"one of {listed}", got=value, example=example)
+        known = [_written(choice) for choice in choices]
+        example = f"{key}={nearest(value, known) or known[0]}"
+        raise fail(key, expected=f"one of {'|'.join(known)}", got=value, example=example)
 
 
-def _nearest(value: object, choices: Sequence[object]) -> str:
-    """Return the choice nearest to ``value`` as it is typed, or the first one if none is near."""
-    texts = {_written(choice).lower(): _written(choice) for choice in choices}
-    near = difflib.get_close_matches(str(value).lower(), list(texts), n=1)
-    return texts[near[0]] if near else _written(choices[0])
+def nearest(word: object, known: Iterable[str], *, least: float = 0.6) -> str:
+    """Return the known word that ``word`` is probably a misspelling of, in upper or lower case; "" if none.
+
+    ``least`` is the smallest similarity in [0, 1], where 1 stands for equal words.
+    """
+    by_lower = {name.lower(): name for name in known}
+    near = difflib.get_close_matches(str(word).lower(), list(by_lower), n=1, cutoff=least)
+    return by_lower[near[0]] if near else ""
 
 
 def _written(choice: object) -> str:

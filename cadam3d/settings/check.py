@@ -9,8 +9,8 @@ much time, but accepts true as a number and looks at one item of a list only; Hy
 no types such as ``float | Schedule``. It is loaded when the first value is compared, not for a help page.
 """
 
-import difflib
 import inspect
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import is_dataclass
 from functools import cache, reduce
@@ -20,19 +20,25 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
 
-from cadam3d.core.checks import fail
+from cadam3d.core.checks import fail, nearest
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import is_readable, read_yaml
+from cadam3d.settings.advice import MissingValuesError, settings_page
+from cadam3d.settings.compose import flatten
+from cadam3d.settings.line import key_of
 from cadam3d.settings.options import (
     NOTHING,
     REFERENCE,
     TARGET,
     config_dir,
+    declared_names,
     example_word,
     load_class,
     option_word,
 )
 
+# The groups of which several options can be chosen.
+LISTS = ("regularizer", "exporter", "callback", "metric")
 # Integers beyond this fit into no tensor.
 LARGEST_WHOLE = 2**63 - 1
 # The types of settings that are null or missing in the YAML files. The others are texts.
@@ -52,6 +58,51 @@ WORDS: dict[Any, str] = {
     Sequence[float]: "a list of numbers",
     Sequence[str]: "a list of texts",
 }
+
+
+def require_effective(cfg: DictConfig, command: str, overrides: Sequence[str]) -> None:
+    """Raise an exception unless all settings of a line have values, and every override has an effect.
+
+    It is ``MissingValuesError`` for a setting that is still ``???``, ``InterpolationResolutionError`` for one
+    that refers to something that does not exist, and ``UserError`` for settings that were removed or that
+    nothing reads. The keys of chosen components are checked when these are built.
+    """
+    raw = OmegaConf.to_container(cfg, resolve=False)
+    assert isinstance(raw, dict)
+    raw.pop("hydra", None)
+    if missing := [key for key, value in flatten(raw) if value == NOTHING]:
+        raise MissingValuesError(missing)
+    declared = declared_names(command)
+    for override in overrides:
+        key = key_of(override)
+        if key in declared - raw.keys() and (override.startswith("~") or override.endswith("=[]")):
+            raise fail(key, expected="a value", got=override, example=example_word(key))
+    # Plain values come first, so that the message names the wrong value and not a setting that refers to it.
+    for key in sorted(raw, key=lambda key: isinstance(raw[key], dict)):
+        if "${" in str(raw[key]) and OmegaConf.is_config(value := cfg[key]):
+            OmegaConf.to_container(value, resolve=True)
+    _require_known(raw, declared, command)
+    _require_chosen(raw, overrides)
+
+
+def _require_known(raw: Mapping[Any, Any], declared: set[str], command: str) -> None:
+    """Refuse unknown settings. One of the user's own YAML is accepted if another setting refers to it."""
+    references = " ".join(re.findall(r"\$\{[^}]*", str(raw)))
+    for name in map(str, raw):
+        if name not in declared and not re.search(rf"\b{re.escape(name)}\b", references):
+            near = nearest(name, declared)
+            meant = f" Did you mean {near}?" if near else ""
+            raise UserError(f"{name}: no such setting.{meant} Try: {settings_page(command)}")
+
+
+def _require_chosen(raw: Mapping[Any, Any], overrides: Sequence[str]) -> None:
+    """Refuse the settings of a member that is not chosen, such as ``+callback.candidates.every=5``."""
+    for group, node in raw.items():
+        for member, values in node.items() if group in LISTS and isinstance(node, dict) else ():
+            is_typed = any(key_of(override).startswith(f"{group}.{member}.") for override in overrides)
+            if is_typed and isinstance(values, dict) and TARGET not in values:
+                chosen = ",".join(map(str, node))
+                raise UserError(f"{group}.{member}: is not chosen. Try: '{group}=[{chosen}]'")
 
 
 def require_settings(values: Mapping[Any, Any]) -> None:
@@ -93,8 +144,8 @@ def _require_keys(names: Sequence[str], parameters: Mapping[str, inspect.Paramet
     kinds = {each.kind for each in parameters.values()}
     unknown = [name for name in names if name not in parameters]
     if unknown and inspect.Parameter.VAR_KEYWORD not in kinds:
-        near = difflib.get_close_matches(unknown[0], list(parameters), n=1)
-        meant = f" Did you mean {key}.{near[0]}?" if near else ""
+        near = nearest(unknown[0], parameters)
+        meant = f" Did you mean {key}.{near}?" if near else ""
         raise UserError(f"{key}: there is no key {unknown[0]}.{meant} Try: cadam3d train --cfg job")
     variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
     needed = [

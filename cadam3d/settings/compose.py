@@ -1,10 +1,12 @@
 """Compose: read the YAML files and apply the overrides of a command line, as Hydra does."""
 
 import math
+import os
 import re
+import sys
 import unicodedata
 from argparse import Namespace
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,8 +35,6 @@ TEXT_KEYS = ("prompt", "negative_prompt")
 SEARCH_PATH = "hydra.searchpath"
 # Characters. At three bytes each they still fit into a file name.
 SLUG_LENGTH = 60
-# Characters of a key. Hydra looks for a folder with the name of every key.
-LONGEST_KEY = 200
 
 
 @dataclass(frozen=True)
@@ -121,6 +121,30 @@ def _own_hydra(folder: Path) -> Iterator[None]:
     finally:
         GlobalHydra.instance().hydra = outer
         VersionBase.instance().version_base = version
+
+
+def print_nothing(_cfg: DictConfig) -> None:
+    """Do nothing, as the function that Hydra does not call when it prints a page."""
+
+
+def run_hydra(
+    command: str, arguments: Sequence[str], run: Callable[[DictConfig], Any] = print_nothing
+) -> None:
+    """Run Hydra's main function on ``arguments`` and the YAML of ``command``.
+
+    It prints one of Hydra's pages, or lets a launcher call ``run`` for each of many jobs. Raises Hydra's
+    exceptions.
+    """
+    register_resolvers()
+    arguments_before, switch_before = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    sys.argv = [sys.argv[0], *arguments]
+    # Otherwise Hydra would print exceptions and exit.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        hydra.main(version_base=VERSION_BASE, config_path=str(config_dir()), config_name=command)(run)()
+    finally:
+        sys.argv = arguments_before
+        os.environ["HYDRA_FULL_ERROR"] = switch_before or "0"
 
 
 def _parsed(override: str) -> Any:

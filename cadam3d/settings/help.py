@@ -11,14 +11,13 @@ import textwrap
 from argparse import Namespace
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, reduce
+from functools import cache, cached_property
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from cadam3d.core.errors import UserError
+from cadam3d.core.checks import fail, nearest
 from cadam3d.io.reading import read_text, read_yaml
-from cadam3d.settings.advice import did_you_mean
 from cadam3d.settings.options import TARGET, config_dir, option_file, option_names, package_of, read_option
 
 NARROWEST, WIDEST = 60, 120  # characters per line
@@ -41,7 +40,6 @@ class Setting:
     # As it is typed, or the call that builds an object, such as "Linear(start=0.98, end=0.5, steps=500)".
     value: str
     words: str
-    is_object: bool  # the value is an object or a group of keys, with settings of its own
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +47,7 @@ class Option:
     """An option that ``group=name`` chooses, or a command with its settings outside of all groups."""
 
     about: str  # paragraphs between empty lines; a line that begins with a space is an example
-    target: str  # the class, such as "cadam3d.camera.orbit.Orbit", or ""
-    base: str  # the option of the same group that this one builds on, or ""
+    base: str = ""  # the option of the same group that this one builds on, or ""
     settings: tuple[Setting, ...]
     changed: tuple[str, ...]  # keys to which the file itself gives a value
 
@@ -61,7 +58,6 @@ class Choices:
 
     name: str  # such as "camera", or "initializer/fallback" for a group inside a group
     chosen: tuple[str, ...]  # the default
-    is_list: bool  # several options can be chosen
     words: str
 
 
@@ -86,16 +82,14 @@ class Library:
     def groups(self, command: str) -> dict[str, Choices]:
         """Return the groups of a command, with those of the command that it builds on first."""
         path = self._command(command)
-        words = {
-            found[1]: found[2] or "" for found in map(ENTRY.match, read_text(path).splitlines()) if found
-        }
+        entries = [found for line in read_text(path).splitlines() if (found := ENTRY.match(line))]
+        words = {entry[1]: entry[2] or "" for entry in entries}
         bases, choices = _defaults(read_yaml(path))
         groups = {name: group for base in bases for name, group in self.groups(base).items()}
-        choices.pop("hydra", None)
-        for name in choices:
-            value, is_list = choices[name], isinstance(choices[name], list)
-            chosen = tuple(map(str, value if is_list else [] if value is None else [value]))
-            groups[name] = Choices(name=name, chosen=chosen, is_list=is_list, words=words[name])
+        for name, value in choices.items():
+            if name != "hydra":
+                several = value if isinstance(value, list) else [] if value is None else [value]
+                groups[name] = Choices(name=name, chosen=tuple(map(str, several)), words=words[name])
         return groups
 
     def command(self, name: str) -> Option:
@@ -106,8 +100,7 @@ class Library:
         own = {key: value for key, value in values.items() if key not in outside}
         inherited = [each for base in _defaults(values)[0] for each in self.command(base).settings]
         settings = (*inherited, *_settings(own, _words_in(path)))
-        about = about_of(read_text(path))
-        return Option(about=about, target="", base="", settings=settings, changed=tuple(own))
+        return Option(about=about_of(read_text(path)), settings=settings, changed=tuple(own))
 
     def option(self, group: str, name: str, command: str = "train") -> Option:
         """Return an option with all its settings, including those of the option that it builds on.
@@ -118,13 +111,9 @@ class Library:
         values, content = read_option(group, name, self.folders), read_yaml(path)
         values.pop("hydra", None)
         bases, choices = _defaults(content)
-        node = reduce(lambda inner, part: inner.get(part) or {}, group.split("/"), values)
-        own_words, known = self._words(group, name), self._words_elsewhere(values, group, command)
-        # Words about a setting of another group are a note about its value here.
-        here = {key: words for key, words in own_words.items() if key.partition(".")[0] == _head(group)}
-        words = _noted(known, own_words) | here
+        known = self._words_elsewhere(values, group, command)
         chosen = [
-            Setting(key=key, value=_spelled(value), words=self._about_choice(key, value), is_object=False)
+            Setting(key=key, value=_spelled(value), words=self._about_choice(key, value))
             for key, value in choices.items()
             if key in self.options
         ]
@@ -132,28 +121,33 @@ class Library:
         changed = _settings(own, {}, "".join(f"{part}." for part in package_of(group, path)))
         return Option(
             about=about_of(read_text(path)),
-            target=str(node.get(TARGET) or (node.get(name) or {}).get(TARGET) or ""),
             base=next((base for base in bases if "/" not in base), ""),
-            settings=(*chosen, *_settings(values, words)),
+            settings=(*chosen, *_settings(values, known | self._words(group, name, known))),
             changed=(*choices, *(each.key for each in changed)),
         )
 
     def _command(self, name: str) -> Path:
-        places = [folder / f"{name}.yaml" for folder in self.folders]
-        if found := [path for path in places if path.is_file()]:
-            return found[0]
-        listed = " or ".join(map(str, self.folders))
-        raise UserError(f"{name}.yaml: expected this file in {listed}, got none. Try: cadam3d doctor")
+        for folder in self.folders:
+            if (path := folder / f"{name}.yaml").is_file():
+                return path
+        raise fail("--config-name", expected="a file of YAML", got=f"{name}.yaml", example="cadam3d doctor")
 
-    def _words(self, group: str, name: str) -> dict[str, str]:
-        """Return the words in the file of an option and in those that it builds on, by full key."""
+    def _words(self, group: str, name: str, known: Mapping[str, str]) -> dict[str, str]:
+        """Return the words in the file of an option and in those that it builds on, by full key.
+
+        They are notes about the values, if ``known`` has the words about the keys of other groups.
+        """
         path = option_file(group, name, self.folders)
-        known: dict[str, str] = {}
+        words: dict[str, str] = {}
         for base in _defaults(read_yaml(path))[0]:
             inner, _, option = base.lstrip("/").rpartition("/")
-            known |= self._words(inner or group, option)
+            words |= self._words(inner or group, option, known)
         place = package_of(group, path)
-        return _noted(known, {".".join([*place, key]): each for key, each in _words_in(path).items()})
+        for last, note in _words_in(path).items():
+            key = ".".join([*place, last])
+            meaning = words.get(key) or (known.get(key, "") if not place else "")
+            words[key] = _with_note(meaning, note)
+        return words
 
     def _words_elsewhere(self, values: dict[str, Any], group: str, command: str) -> dict[str, str]:
         """Return the words that the command and other options have for the keys of an option.
@@ -162,24 +156,24 @@ class Library:
         """
         words = {each.key: each.words for each in self.command(command).settings}
         groups = self.groups(command)
-        for root in values.keys() & self.options.keys() - {_head(group)}:
+        for root in values.keys() & self.options.keys() - {group.partition("/")[0]}:
             first = groups[root].chosen if root in groups else ()
             for name in reversed([*first, *self.options[root]]):
-                words |= self._words(root, name)
-        for key, target in _keys_by_class(values):
-            if meaning := self._words_by_class.get((target, key.rpartition(".")[2])):
-                words.setdefault(key, meaning)
-        return words
+                words |= self._words(root, name, {})
+        same_class = {
+            key: self._words_by_class.get((target, key.rpartition(".")[2]), "")
+            for key, target in _keys_by_class(values)
+        }
+        return same_class | words
 
     @cached_property
     def _words_by_class(self) -> dict[tuple[str, str], str]:
         """Return the words for the settings of objects, by class and key, in all options."""
         known: dict[tuple[str, str], str] = {}
-        for group in self.options:
-            for name in self.options[group]:
-                path = option_file(group, name, self.folders)
-                values, words = read_yaml(path), _words_in(path)
-                for key, target in _keys_by_class(values if isinstance(values, dict) else {}):
+        for group, names in self.options.items():
+            for path in (option_file(group, name, self.folders) for name in names):
+                words = _words_in(path)
+                for key, target in _keys_by_class(read_yaml(path)):
                     if key in words:
                         known.setdefault((target, key.rpartition(".")[2]), words[key])
         return known
@@ -198,40 +192,32 @@ def help_text(command: str, overrides: Sequence[str], options: Namespace) -> str
     """
     folders = [Path(options.config_dir)] if options.config_dir else []
     library = Library([*folders, Path(options.config_path) if options.config_path else config_dir()])
-    config_name = options.config_name or command
-    groups = _groups(library, config_name)
-    width = min(max(shutil.get_terminal_size((100, 24)).columns, NARROWEST), WIDEST)
+    groups = _groups(library, options.config_name or command)
     parts = []
     for word in overrides:
         name, equals, value = word.lstrip("+").partition("=")
         if name in groups and equals:
             chosen = [option for option in NAME.findall(value) if option != "null"]
-            parts += [_option(library, command, name, option, width) for option in chosen]
+            parts += [_option(library, command, name, option) for option in chosen]
         elif name in groups:
-            parts += [_group(library, groups[name], width), _hint(command, groups[name], width)]
+            parts += [_group(library, groups[name]), _hint(command, groups[name])]
         elif name in library.options or not equals:
-            near = did_you_mean(name.partition(".")[0], list(groups)) or list(groups)
-            raise UserError(
-                f"{word!r}: expected a group of cadam3d {command} ({', '.join(groups) or 'it has none'}). "
-                f"Try: {' '.join(['cadam3d', command, '--help', *near[:1]])}"
-            )
-    return "\n\n".join(parts) if parts else _overview(library, command, config_name, groups, width)
+            line = f"cadam3d {command} --help {nearest(name, groups)}".rstrip()
+            raise fail("--help", expected=f"a group of {command}", got=name, example=line)
+    return "\n\n".join(parts) if parts else _overview(library, command, options, groups)
 
 
 def about_of(text: str) -> str:
     """Return the first comment of a file: paragraphs in one line each, and lines of examples."""
     lines = [line for line in text.splitlines() if not line.startswith("# @package ")]
     flowing = [""]
-    for line in (each[1:].removeprefix(" ").rstrip() for each in takewhile(_is_comment, lines)):
-        if line and flowing[-1] and not line.startswith(" ") and not flowing[-1].startswith(" "):
-            flowing[-1] += " " + line
+    for line in takewhile(lambda line: line.startswith("#"), lines):
+        words = line[1:].removeprefix(" ").rstrip()
+        if words and flowing[-1] and not words.startswith(" ") and not flowing[-1].startswith(" "):
+            flowing[-1] += " " + words
         else:
-            flowing.append(line)
+            flowing.append(words)
     return "\n".join(flowing).strip("\n")
-
-
-def _is_comment(line: str) -> bool:
-    return line.startswith("#")
 
 
 @cache
@@ -281,10 +267,6 @@ def _keys_by_class(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[s
             yield from _keys_by_class(value, f"{prefix}{name}.")
 
 
-def _head(group: str) -> str:
-    return group.partition("/")[0]
-
-
 def _settings(values: dict[str, Any], words: Mapping[str, str], prefix: str = "") -> Iterator[Setting]:
     """Yield the settings in nested values. The numbers of a schedule are part of its value.
 
@@ -295,15 +277,9 @@ def _settings(values: dict[str, Any], words: Mapping[str, str], prefix: str = ""
         target = str(value.get(TARGET, "")) if isinstance(value, dict) else ""
         is_branch = isinstance(value, dict) and not (target and prefix and key in words)
         if name != TARGET and (not is_branch or key in words):
-            text = "" if is_branch else _spelled(value)
-            yield Setting(key=key, value=text, words=words.get(key, ""), is_object=isinstance(value, dict))
+            yield Setting(key=key, value="" if is_branch else _spelled(value), words=words.get(key, ""))
         if isinstance(value, dict) and not target.startswith(SCHEDULES):
             yield from _settings(value, words, f"{key}.")
-
-
-def _noted(known: Mapping[str, str], own: Mapping[str, str]) -> dict[str, str]:
-    """Return the words for keys, with those of one file as notes about its values."""
-    return {**known, **{key: _with_note(known.get(key, ""), note) for key, note in own.items()}}
 
 
 def _with_note(meaning: str, note: str) -> str:
@@ -319,9 +295,9 @@ def _spelled(value: Any) -> str:
         return f"[{','.join(map(_spelled, value))}]"
     if isinstance(value, dict):
         name = str(value.get(TARGET, "")).rpartition(".")[2]
-        is_short = name and not value[TARGET].startswith(SCHEDULES)
         inner = ", ".join(f"{key}={_spelled(each)}" for key, each in value.items() if key != TARGET)
-        return name if is_short else f"{name}({inner})"
+        is_short = name and not value[TARGET].startswith(SCHEDULES)
+        return f"{name}({'...' if is_short else inner})"
     if value is None or isinstance(value, bool):
         return str(value).lower().replace("none", "null")
     return str(value) or '""'
@@ -336,82 +312,78 @@ def _groups(library: Library, command: str) -> dict[str, Choices]:
                 groups[name] = group
             elif name.startswith(f"{group.name}/"):
                 words = "an option for the setting of this name"
-                groups[name] = Choices(name=name, chosen=(), is_list=False, words=words)
+                groups[name] = Choices(name=name, chosen=(), words=words)
     return groups
 
 
-def _overview(
-    library: Library, command: str, config_name: str, groups: dict[str, Choices], width: int
-) -> str:
+def _overview(library: Library, command: str, options: Namespace, groups: dict[str, Choices]) -> str:
     """Return the purpose of a command, its settings, and its groups with their options."""
-    about = library.command(config_name)
-    parts = [_paragraphs(about.about, width)]
+    about = library.command(options.config_name or command)
+    parts = [_paragraphs(about.about)]
     if about.settings:
-        parts.append("Settings (key=value):\n" + _table_of(about.settings, width))
+        parts.append("Settings (key=value):\n" + _table_of(about.settings))
     if groups:
-        lists = [f"'{group.name}=[{','.join(group.chosen)}]'" for group in groups.values() if group.is_list]
-        note = f"; a list needs quotes, as in {lists[0]}" if lists else ""
-        parts.append(_fill(f"Parts (group=option{note}). * marks what is chosen by default.", width))
-        parts += [_group(library, group, width) for group in groups.values()]
-        parts.append(_hint(command, groups.get("densifier") or next(iter(groups.values())), width))
+        parts.append(_fill("Parts (group=option, or 'group=[one,two]'). * marks what is chosen by default."))
+        parts += [_group(library, group) for group in groups.values()]
+        parts.append(_hint(command, groups.get("densifier") or next(iter(groups.values()))))
     return "\n\n".join(parts)
 
 
-def _group(library: Library, group: Choices, width: int) -> str:
+def _group(library: Library, group: Choices) -> str:
     """Return the text for a group, with one line for each option."""
     rows = [
         (("* " if name in group.chosen else "  ") + name, library.summary(group.name, name))
         for name in library.options[group.name]
     ]
     title = f"{group.name}: {group.words}" if group.words else group.name
-    return "\n".join([_fill(title, width, indent="  "), *_table(rows, width, widest=24)])
+    return "\n".join([_fill(title, indent="  "), *_table(rows, widest=24)])
 
 
-def _option(library: Library, command: str, group: str, name: str, width: int) -> str:
+def _option(library: Library, command: str, group: str, name: str) -> str:
     """Return the text for an option and its settings. Raises ``UserError`` if there is no such option."""
     option = library.option(group, name, command)
-    lines = [f"{group}={name}" + (f" ({option.target})" if option.target else "")]
-    lines.append(_paragraphs(option.about, width))
+    lines = [f"{group}={name}", _paragraphs(option.about)]
     if option.base:
         changed = ", ".join(key.removeprefix(f"{group}.") for key in option.changed)
-        lines.append(_fill(f"Builds on {group}={option.base} and changes {changed}.", width))
-    return "\n".join([*lines, _table_of(option.settings, width) or "  It has no settings."])
+        lines.append(_fill(f"Builds on {group}={option.base} and changes {changed}."))
+    return "\n".join([*lines, _table_of(option.settings) or "  It has no settings."])
 
 
-def _table_of(settings: Iterable[Setting], width: int) -> str:
+def _table_of(settings: Iterable[Setting]) -> str:
     """Return a table with one row for each setting, under the key of the command line."""
     rows = []
     for each in settings:
-        sign = ": " if each.is_object and each.value else "" if each.is_object else "="
+        sign = "" if not each.value else ": " if each.value.endswith(")") else "="
         rows.append((f"  {each.key}{sign}{each.value}", each.words))
-    return "\n".join(_table(rows, width, widest=FIRST_COLUMN))
+    return "\n".join(_table(rows, widest=FIRST_COLUMN))
 
 
-def _table(rows: Sequence[tuple[str, str]], width: int, *, widest: int) -> Iterator[str]:
+def _table(rows: Sequence[tuple[str, str]], *, widest: int) -> Iterator[str]:
     """Yield the lines of a table of two columns, the second of which is wrapped."""
     column = min(max((len(first) for first, _ in rows), default=0), widest) + 2
     for first, second in rows:
-        lines = textwrap.wrap(second, width - column, break_long_words=False, break_on_hyphens=False)
+        lines = textwrap.wrap(second, _width() - column, break_long_words=False, break_on_hyphens=False)
         is_short = len(first) <= column - 2
         yield (first.ljust(column) + (lines.pop(0) if lines else "")).rstrip() if is_short else first
         yield from (" " * column + line for line in lines)
 
 
-def _paragraphs(text: str, width: int) -> str:
+def _paragraphs(text: str) -> str:
     """Wrap each line of a text, except those that begin with a space."""
-    return "\n".join(line if line.startswith(" ") else _fill(line, width) for line in text.splitlines())
+    return "\n".join(line if line.startswith(" ") else _fill(line) for line in text.splitlines())
 
 
-def _hint(command: str, group: Choices, width: int) -> str:
+def _hint(command: str, group: Choices) -> str:
     """Return a hint about the pages with more details."""
-    example = group.chosen[0] if group.chosen else "NAME"
-    text = (
-        f"cadam3d {command} --help {group.name}={example} lists the settings of an option. "
-        f"cadam3d {command} --cfg job prints the settings that a command line runs with."
-    )
-    return _fill(text, width)
+    example = f"{group.name}={group.chosen[0] if group.chosen else 'NAME'}"
+    return _fill(f"More: cadam3d {command} --help {example}, or cadam3d {command} --cfg job.")
 
 
-def _fill(text: str, width: int, *, indent: str = "") -> str:
-    """Return ``text`` in lines of at most ``width`` characters, the later ones indented; words stay whole."""
-    return textwrap.fill(text, width, subsequent_indent=indent, break_on_hyphens=False)
+def _fill(text: str, *, indent: str = "") -> str:
+    """Return ``text`` in lines of the terminal, the later ones indented; words stay whole."""
+    return textwrap.fill(text, _width(), subsequent_indent=indent, break_on_hyphens=False)
+
+
+def _width() -> int:
+    """Return the number of characters in a line."""
+    return min(max(shutil.get_terminal_size((100, 24)).columns, NARROWEST), WIDEST)

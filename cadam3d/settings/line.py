@@ -44,8 +44,8 @@ NOT_A_TEXT = re.compile(
 )
 QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""", re.DOTALL)
 SWEEP_CALL = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)", re.DOTALL)
-# The text up to a comma that is not followed by a space.
-PIECE = re.compile(r"(?:[^,]|,(?=\s|$))*", re.DOTALL)
+# A comma between two prompts; one before a space belongs to a sentence.
+SEPARATOR = r",(?!\s|$)"
 FLAGS_WITH_VALUE = (
     *("--cfg", "-c", "--package", "-p", "--info", "-i"),
     *("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
@@ -142,12 +142,12 @@ def quoted(override: str, *, is_sweep: bool) -> str:
     if not equals or QUOTED.fullmatch(value):
         return override
     if name in LIST_KEYS and is_list(override) and "${" not in value:
-        return f"{key}=[{','.join(map(_item, _items(value[1:-1])))}]"
+        return f"{key}=[{','.join(map(_item, _pieces(value[1:-1], ',')))}]"
     is_plain = PLAIN_PATH.fullmatch(value) and not NOT_A_TEXT.fullmatch(value)
     if name in PATH_KEYS and not is_plain and "${" not in value:
         return f"{key}={quote(value)}"
     if name in TEXT_KEYS and not (is_sweep and SWEEP_CALL.fullmatch(value)):
-        pieces = _prompts(value) if is_sweep else [value]
+        pieces = _pieces(value, SEPARATOR) if is_sweep else [value]
         return f"{key}=" + ",".join(part if QUOTED.fullmatch(part) else quote(part) for part in pieces)
     return override
 
@@ -199,18 +199,6 @@ def is_list(override: str) -> bool:
     return value.startswith("[") and value.endswith("]") and not os.path.lexists(value)
 
 
-def _items(text: str) -> list[str]:
-    """Split the items of a list at the commas outside of quotation marks."""
-    items, rest = [], text
-    while rest := rest.lstrip():
-        match = QUOTED.match(rest)
-        end = match.end() if match is not None and rest[match.end() :].lstrip()[:1] in ("", ",") else 0
-        end = rest.find(",", end)
-        items.append(rest if end < 0 else rest[:end])
-        rest = "" if end < 0 else rest[end + 1 :]
-    return items
-
-
 def _item(text: str) -> str:
     """Return one item of a list, quoted for Hydra if it is not quoted already."""
     text = text.strip()
@@ -239,15 +227,13 @@ def _merge(merged: dict[str, str], override: str) -> None:
         merged[key] = old[: len(old) - len(old.lstrip("+"))] + override
 
 
-def _prompts(value: str) -> list[str]:
-    """Split the prompts of a sweep at the commas that separate them."""
-    pieces, rest = [], value
-    while True:
-        match = QUOTED.match(rest)
-        if match is None or rest[match.end() : match.end() + 1] not in ("", ","):
-            match = PIECE.match(rest)
-        assert match is not None, "PIECE matches the empty string too"
+def _pieces(text: str, comma: str) -> list[str]:
+    """Split a text at the pattern ``comma``, but not inside quotation marks around a whole piece."""
+    piece = re.compile(rf"\s*(?:{QUOTED.pattern})\s*(?=,|$)|(?:(?!{comma}).)*", re.DOTALL)
+    pieces, position = [], 0
+    while match := piece.match(text, position):
         pieces.append(match.group().strip())
-        if match.end() == len(rest):
-            return pieces
-        rest = rest[match.end() + 1 :]
+        if match.end() == len(text):
+            break
+        position = match.end() + 1
+    return pieces

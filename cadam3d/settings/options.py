@@ -8,7 +8,6 @@ package. Nothing is composed here.
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from difflib import get_close_matches
 from functools import cache
 from inspect import isabstract, isclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from hydra.utils import get_object
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from cadam3d.core.checks import nearest
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import read_text, read_yaml
 from cadam3d.io.run_folder import LATEST
@@ -50,8 +50,8 @@ def option_file(group: str, name: str, folders: Sequence[Path] = ()) -> Path:
         if (path := folder / group / f"{name}.yaml").is_file():
             return path
     known = option_names(group, folders)
-    near = get_close_matches(name, known, n=1)
-    word = f"{group}={near[0]}" if near else option_word(group)
+    near = nearest(name, known)
+    word = f"{group}={near}" if near else option_word(group)
     raise UserError(f"{group}: expected one of {'|'.join(known)}, got {name!r}. Try: {word}")
 
 
@@ -113,6 +113,14 @@ def default_options(command: str = "train") -> dict[str, str | list[str] | None]
         elif entry != "_self_":
             found |= default_options(entry)
     return found
+
+
+def declared_names(command: str) -> set[str]:
+    """Return the settings and groups that the YAML of a command declares, with those that it builds on."""
+    page = read_yaml(config_dir() / f"{command}.yaml")
+    bases = [entry for entry in page["defaults"] if isinstance(entry, str) and entry != "_self_"]
+    own = {*page, *default_options(command)} - {"defaults"}
+    return own.union(*map(declared_names, bases))
 
 
 def default_option(group: str, command: str = "train") -> str | list[str] | None:

@@ -30,7 +30,7 @@ from cadam3d.core import schedule
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import KINDS, read_text, read_yaml
-from cadam3d.settings.compose import LONGEST_KEY, escaped
+from cadam3d.settings.compose import escaped
 from cadam3d.settings.options import TARGET, config_dir
 
 # The last part of a key that names a folder from which this machine loads what it has computed earlier.
@@ -169,7 +169,7 @@ def _lacking(override: Override, folders: tuple[Path, ...]) -> str:
     if override.is_sweep_override():
         return "a single value"
     # With a package, as in group@package=option, the value would come to another place.
-    is_plain = KEY.fullmatch(key) and len(key) <= LONGEST_KEY and override.package is None
+    is_plain = KEY.fullmatch(key) and override.package is None
     if not is_plain or _root(key) not in _roots(folders):
         return "a setting of training"
     value = override.value()

@@ -16,10 +16,9 @@ from omegaconf.errors import InterpolationResolutionError
 from cadam3d.core.checks import fail, require, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import RUN_FOLDER, typed_path
-from cadam3d.settings.advice import RefusedJobError, line_of, require_values
-from cadam3d.settings.check import require_settings
+from cadam3d.settings.advice import RefusedJobError, line_of
+from cadam3d.settings.check import require_effective, require_settings
 from cadam3d.settings.compose import compose_line, flatten
-from cadam3d.settings.hydra import refuse_missing_settings, refuse_unread_settings
 from cadam3d.settings.line import DRY_RUN, LAUNCHER_KEY, SWEEP_FOLDER, key_of
 from cadam3d.sweep.folder import Job
 from cadam3d.sweep.grid import (
@@ -182,9 +181,7 @@ class Composer:
         known = tuple(key_of(line) if line in values else line for line in overrides)
         if known not in self._bases:
             base = self._base(overrides)
-            require_values(base.cfg)
-            refuse_missing_settings(base.cfg, "sweep", overrides)
-            refuse_unread_settings(base.cfg, "sweep", overrides)
+            require_effective(base.cfg, "sweep", overrides)
             self._bases[known] = base
         return self._bases[known]
 

@@ -39,8 +39,7 @@ from cadam3d.io.run_folder import (
     setting_word,
     shown,
 )
-from cadam3d.settings.compose import flatten, quote
-from cadam3d.settings.hydra import run_hydra
+from cadam3d.settings.compose import flatten, quote, run_hydra
 from cadam3d.settings.line import NOT_OF_A_RUN, SWEEP_FOLDER
 from cadam3d.settings.trust import is_trusted, require_contained
 from cadam3d.sweep import worker

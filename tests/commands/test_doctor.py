@@ -31,8 +31,8 @@ def test_doctor_reports_on(topic, findings):
 
 
 def test_every_rasterizer_that_this_machine_supports_is_tested(findings):
-    assert findings["rasterizer=reference"].facts["agrees"]
-    assert findings["rasterizer=auto"].facts["backend"] in ("cpu", "cuda", "reference")
+    assert findings["rasterizer=reference"].verdict is Verdict.OK
+    assert findings["rasterizer=auto"].found.startswith("chooses ")
     assert "kernels for cpu" in findings
     assert "kernels for cuda" in findings
 
@@ -116,14 +116,13 @@ def test_a_broken_finding_prints_its_hint_and_causes_exit_code_1(monkeypatch, ty
 
 @pytest.mark.parametrize("word", ["json=true", "--json"])
 def test_json_is_one_object_for_other_programs(word, monkeypatch, type_line):
-    replace_findings(monkeypatch, Finding("torch", Verdict.BROKEN, "gone", "hint", {"size": 3}))
+    replace_findings(monkeypatch, Finding("torch", Verdict.BROKEN, "gone", "hint"))
     code, out, _ = type_line("doctor", word)
     report = json.loads(out)
     assert code == 1
     assert report["ok"] is False
-    assert report["findings"] == [
-        {"topic": "torch", "verdict": "broken", "found": "gone", "hint": "hint", "facts": {"size": 3}}
-    ]
+    [finding] = report["findings"]
+    assert finding == {"topic": "torch", "verdict": "broken", "found": "gone", "hint": "hint"}
 
 
 def test_python_that_is_too_old_is_broken(monkeypatch):
@@ -139,5 +138,5 @@ def test_a_gpu_that_torch_cannot_use_gets_a_hint(monkeypatch):
     monkeypatch.setattr(doctor, "_run_program", lambda command: (0, "GPU 0"))
     finding = doctor._device()
     assert finding.verdict is Verdict.NOTE
-    assert "there is a GPU" in finding.found
+    assert "torch cannot use the GPU" in finding.found
     assert finding.hint.startswith("Try: pip install")

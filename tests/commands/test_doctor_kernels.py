@@ -1,10 +1,8 @@
 """The rasterizer checks of ``cadam3d doctor`` test every backend that works and name the missing parts."""
 
 import ctypes
-import json
 import math
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import replace
 
 import pytest
 import torch
@@ -53,9 +51,7 @@ def agreement() -> Agreement:
 
 
 def by_topic() -> dict[str, Finding]:
-    found = list(check_kernels())
-    assert all(json.loads(json.dumps(asdict(finding), allow_nan=False)) for finding in found)
-    return {finding.topic: finding for finding in found}
+    return {finding.topic: finding for finding in check_kernels()}
 
 
 @needs_compiler
@@ -67,13 +63,10 @@ def test_the_native_kernels_are_named_and_tested():
     )
     assert find_compiler().version in kernels.found
     assert kernels.found.endswith(f" in {cache}")
-    assert kernels.facts["instruction_set"] in ("avx512", "avx2", "sse2", "neon", "generic")
-    assert Path(kernels.facts["path"]).is_file()
     assert test.verdict is Verdict.OK
     assert test.found.startswith("agrees with the reference: images ")
     assert test.found.endswith("same bits twice, on cpu")
-    assert test.facts["agrees"]
-    assert choice.facts == {"device": "cpu", "backend": "cpu", "reason": None}
+    assert choice.found.startswith("chooses cpu on cpu")
 
 
 @needs_compiler
@@ -83,16 +76,12 @@ def test_the_native_kernels_are_named_and_tested():
 def test_the_finding_states_whether_kernels_were_compiled_now(seconds, words, monkeypatch):
     built = replace(library.build(cpu_library(), kernels_dir(None)), seconds=seconds)
     monkeypatch.setattr(library, "build", lambda library, cache_dir: built)
-    finding = doctor_kernels._cpu_kernels()
-    assert words in finding.found
-    assert finding.facts["compiled_now"] is (seconds > 0)
-    assert finding.facts["compile_seconds"] == seconds
+    assert words in doctor_kernels._cpu_kernels().found
 
 
 def test_with_nothing_installed_the_reference_is_tested_and_the_rest_is_named_as_missing(bare):
     found = by_topic()
     assert found["rasterizer=reference"].verdict is Verdict.OK
-    assert found["rasterizer=reference"].facts["agrees"]
     assert not [finding for finding in found.values() if finding.verdict is Verdict.BROKEN]
     assert "pip install 'cadam3d[compiler]'" in found["kernels for cpu"].found
     assert "rasterizer=cpu" not in found
@@ -102,7 +91,6 @@ def test_with_nothing_installed_the_reference_is_tested_and_the_rest_is_named_as
     assert choice.found.startswith(
         "chooses reference on cpu, which is slow: rasterizer=cpu: expected a C++ compiler"
     )
-    assert choice.facts["backend"] == "reference"
 
 
 def an_nvrtc() -> nvrtc.Nvrtc:
@@ -186,7 +174,6 @@ def test_a_failed_self_test_is_reported(topic, device, change, verdict, monkeypa
     finding = doctor_kernels._tested(topic, ReferenceRasterizer(), torch.device(device), demands)
     assert finding.verdict is verdict
     assert ("report" in finding.hint) is (verdict is not Verdict.OK)
-    json.dumps(finding.facts, allow_nan=False)
 
 
 def test_a_self_test_that_crashes_is_a_finding(monkeypatch):
@@ -203,11 +190,7 @@ def test_a_self_test_that_crashes_is_a_finding(monkeypatch):
 def test_the_native_tracer_is_named_and_agrees_with_torch():
     finding = attempt(TRACER, doctor_kernels._tracer)
     assert (finding.topic, finding.verdict) == (TRACER, Verdict.OK)
-    assert finding.found.startswith(
-        f"native, {finding.facts['instruction_set']} by {find_compiler().version}, "
-    )
-    assert finding.facts["difference"] <= 1e-6
-    assert json.loads(json.dumps(asdict(finding), allow_nan=False))
+    assert f" by {find_compiler().version}, " in finding.found
 
 
 @needs_compiler
@@ -230,4 +213,3 @@ def test_without_a_compiler_the_tracer_in_torch_is_named_with_the_reason(monkeyp
     finding = attempt(TRACER, doctor_kernels._tracer)
     assert finding.verdict is Verdict.NOTE
     assert finding.found.startswith("torch, which is slow: prior.tracer=native: expected a C++ compiler")
-    assert finding.facts == {"tracer": "torch"}

@@ -96,7 +96,7 @@ def test_an_option_inherits_the_descriptions_of_its_base(tmp_path):
         "thing.rate": ("5", "per step. Here: small"),
         "thing.kept": ("3", "as it is"),
     }
-    assert (option.base, option.target, option.changed) == ("base", "a.B", ("thing.size", "thing.rate"))
+    assert (option.base, option.changed) == ("base", ("thing.size", "thing.rate"))
 
 
 def test_a_key_without_a_description_has_the_one_in_another_option_of_its_class(tmp_path):
@@ -193,10 +193,10 @@ def test_options_of_a_user_folder_are_listed_too(tmp_path):
 @pytest.mark.parametrize(
     ("words", "command", "message"),
     [
-        (("densifier=cadamm",), "train", r"got 'cadamm'. Try: densifier=cadam$"),
-        (("densifer",), "train", r"Try: cadam3d train --help densifier$"),
-        (("grid=thresholds",), "train", r"^'grid=thresholds': expected a group of cadam3d train "),
-        (("camera",), "doctor", r"Try: cadam3d doctor --help$"),
+        (("densifier=cadamm",), "train", r"got 'cadamm'.* Try: densifier=cadam$"),
+        (("densifer",), "train", r"got 'densifer'\. Try: cadam3d train --help densifier$"),
+        (("grid=thresholds",), "train", r"got 'grid'"),
+        (("camera",), "doctor", r"got 'camera'"),
     ],
 )
 def test_the_message_for_an_unknown_name_suggests_a_similar_one(words, command, message):
@@ -206,7 +206,7 @@ def test_the_message_for_an_unknown_name_suggests_a_similar_one(words, command, 
 
 def test_a_config_that_does_not_exist_is_named():
     flags = Namespace(config_dir=None, config_path=None, config_name="mine")
-    with pytest.raises(UserError, match=r"^mine\.yaml: expected this file in "):
+    with pytest.raises(UserError, match=r"got 'mine\.yaml'"):
         page(flags=flags)
 
 

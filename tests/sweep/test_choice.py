@@ -11,8 +11,8 @@ from declarations import all_numbers, declared
 from cadam3d import cli
 from cadam3d.commands.linking import link_best
 from cadam3d.io import links
-from cadam3d.settings import advice, hydra, options
 from cadam3d.settings import compose as settings
+from cadam3d.settings import options
 from cadam3d.sweep import start
 from cadam3d.sweep.choice import Attempt, choose
 from cadam3d.sweep.process import run_job
@@ -131,7 +131,7 @@ def train(monkeypatch, capfd, tmp_path, attempt_configs, stand_in):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONSAFEPATH", "1")
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-    for module in (settings, hydra, advice, options):
+    for module in (settings, options):
         monkeypatch.setattr(module, "config_dir", lambda: attempt_configs)
     monkeypatch.setattr(sys, "executable", str(stand_in))
     monkeypatch.setattr(start, "run_hydra", run_jobs)

@@ -18,8 +18,8 @@ from omegaconf import OmegaConf
 
 from cadam3d import cli
 from cadam3d.io.run_folder import JOBS
-from cadam3d.settings import advice, hydra, options
 from cadam3d.settings import compose as settings
+from cadam3d.settings import options
 from cadam3d.settings.line import read_flags
 from cadam3d.sweep import plan, start
 from cadam3d.sweep.folder import Row, load, read_plan
@@ -68,7 +68,7 @@ def hydra_sweep(monkeypatch, capfd, tmp_path, small_configs, stand_in):
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     # The program sets this variable; it is restored after the test.
     monkeypatch.setenv("PYTHONSAFEPATH", "1")
-    for module in (settings, hydra, advice, options):
+    for module in (settings, options):
         monkeypatch.setattr(module, "config_dir", lambda: small_configs)
     monkeypatch.setattr(sys, "executable", str(stand_in))
     monkeypatch.setattr("cadam3d.report.write_sweep", lambda folder: folder / "report.html")
@@ -420,8 +420,8 @@ def start_sweep(tmp_path, small_configs, stand_in):
     def run(*words: str) -> subprocess.Popen:
         code = (
             "import sys; from pathlib import Path; from cadam3d import cli\n"
-            "from cadam3d.settings import advice, hydra, options, compose as settings\n"
-            "for module in (settings, hydra, advice, options):\n"
+            "from cadam3d.settings import options, compose as settings\n"
+            "for module in (settings, options):\n"
             f"    module.config_dir = lambda: Path({str(small_configs)!r})\n"
             f"sys.argv = {['cadam3d', 'sweep', *words]!r}\n"
             "cli.main()"
