@@ -63,11 +63,11 @@ def evaluate(cfg: DictConfig, call: Call, folder: Path) -> dict[str, Any]:
         is_trusted=cfg.trust,
         retry=trusting(call),
     )
-    own = components_of(("prior", "rasterizer", "truth"))
+    own = components_of(("prior", "rasterizer", "truth"), optional=("truth",))
     asset = open_run(folder, cfg.device)
     device = asset.gaussians.device
     prior = component(own.prior, DiffusionPrior, "prior").to(device)
-    node = cfg.get("truth", own.truth)
+    node = cfg.get("truth", own.get("truth"))
     source = PriorTruth() if node is None else component(node, TruthSource, "truth")
     truth = source.of(own.prompt, prior)
 

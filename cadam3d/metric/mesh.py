@@ -86,16 +86,10 @@ class MeshMetric(SurfaceSettings, Metric):
             to_true, to_mesh = distances_between(
                 (surface.vertices, surface.faces), (vertices, faces), self.samples, self.seed
             )
-            score, precision, recall = f_score(to_true, to_mesh, self.threshold)
-            results.append(
-                {
-                    "mesh_chamfer": float((to_true.mean() + to_mesh.mean()) / 2),
-                    "mesh_fscore": score,
-                    "mesh_precision": precision,
-                    "mesh_recall": recall,
-                }
-            )
-        return Measurement(min(results, key=lambda result: result["mesh_chamfer"]))
+            chamfer = float((to_true.mean() + to_mesh.mean()) / 2)
+            results.append((chamfer, *f_score(to_true, to_mesh, self.threshold)))
+        names = [number.name for number in self.numbers]
+        return Measurement(dict(zip(names, min(results), strict=True)))
 
 
 # Vertices "v 3" and triangles "f 3".

@@ -39,13 +39,8 @@ class StudyPlan:
     trials: tuple[Trial, ...]
 
 
-@dataclass(frozen=True)
-class _Sides:
-    """A trial before its clips have numbers."""
-
-    prompt: str
-    sources: tuple[ClipSource, ClipSource]
-    right: ClipSource | None = None
+# A trial before its clips have numbers: prompt, both sides, and the right one of a catch trial.
+Sides = tuple[str, tuple[ClipSource, ClipSource], ClipSource | None]
 
 
 def catch_count(pairs: int, share: float) -> int:
@@ -72,49 +67,43 @@ def make_plan(
         trials.insert(generator.randint(low, max(low, high - 1)) if high > low else low, check)
     # The number of a clip must not show its arm.
     sources = sorted(
-        {source for trial in trials for source in trial.sources},
+        {source for _, sides, _ in trials for source in sides},
         key=lambda source: (source.run.prompt, source.run.arm, str(source.run.folder), source.is_ruined),
     )
     generator.shuffle(sources)
     numbers = {source: number for number, source in enumerate(sources)}
-    return StudyPlan(
-        tuple(sources),
-        tuple(
-            Trial(
-                trial.prompt,
-                (numbers[trial.sources[0]], numbers[trial.sources[1]]),
-                None if trial.right is None else numbers[trial.right],
-            )
-            for trial in trials
-        ),
-    )
+    shown = [
+        Trial(prompt, (numbers[one], numbers[other]), None if right is None else numbers[right])
+        for prompt, (one, other), right in trials
+    ]
+    return StudyPlan(tuple(sources), tuple(shown))
 
 
-def _balanced(pairs: Sequence[RunPair], generator: Random) -> list[_Sides]:
+def _balanced(pairs: Sequence[RunPair], generator: Random) -> list[Sides]:
     """Return every pair as a trial, with sides that are drawn evenly for each two arms."""
     of_arms: dict[tuple[str, str], list[RunPair]] = defaultdict(list)
     for pair in pairs:
         of_arms[pair.arms].append(pair)
-    trials = []
+    trials: list[Sides] = []
     for arms in sorted(of_arms):
         members = of_arms[arms]
         for pair, is_turned in zip(members, _evenly(len(members), generator), strict=True):
             one, other = (ClipSource(run, is_ruined=False) for run in pair.runs)
-            trials.append(_Sides(pair.prompt, (other, one) if is_turned else (one, other)))
+            trials.append((pair.prompt, (other, one) if is_turned else (one, other), None))
     return trials
 
 
-def _catch_trials(visible: Sequence[StudyRun], count: int, generator: Random) -> list[_Sides]:
+def _catch_trials(visible: Sequence[StudyRun], count: int, generator: Random) -> list[Sides]:
     """Return catch trials. Runs repeat only after each of them has been shown."""
     drawn = generator.sample(list(visible), len(visible))
-    trials = []
+    trials: list[Sides] = []
     for number, is_turned in enumerate(_evenly(count, generator)):
         run = drawn[number % len(drawn)]
         # A ruined clip of another object also fails to match the description.
         others = [other for other in drawn if other.prompt != run.prompt]
         right = ClipSource(run, is_ruined=False)
         wrong = ClipSource(generator.choice(others or [run]), is_ruined=True)
-        trials.append(_Sides(run.prompt, (wrong, right) if is_turned else (right, wrong), right))
+        trials.append((run.prompt, (wrong, right) if is_turned else (right, wrong), right))
     return trials
 
 
