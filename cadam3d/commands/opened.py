@@ -15,11 +15,9 @@ from cadam3d.core.checks import require_choice
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.outcome import Outcome
 from cadam3d.core.rendering import RenderFn, RenderOutput
 from cadam3d.io.asset_file import read_gaussians
 from cadam3d.io.frames import UPS
-from cadam3d.io.records import read_summary
 from cadam3d.io.run_folder import (
     ASSET,
     CONFIG,
@@ -56,14 +54,11 @@ def open_asset(cfg: DictConfig) -> OpenedAsset:
 def require_one(cfg: DictConfig) -> None:
     """Raise ``UserError`` unless exactly one of ``run=`` and ``ply=`` is given.
 
-    The value of ``ply=`` must not be the folder of a run, and that of ``ply_up=`` must be an axis or null.
+    The value of ``ply_up=`` must be an axis or null.
     """
     if (cfg.run is None) == (cfg.ply is None):
         got, line = ("neither", f"run={LATEST}") if cfg.run is None else ("both", "ply=null")
         raise UserError(f"run, ply: expected one of them, got {got}. Try: {line}")
-    if cfg.ply is not None and has_file(expanded(str(cfg.ply)), CONFIG):
-        line = f"ply=null {setting_word('run', cfg.ply)}"
-        raise UserError(f"ply: expected a file, got {str(cfg.ply)!r}, the folder of a run. Try: {line}")
     if cfg.ply_up is not None:
         require_choice("ply_up", cfg.ply_up, UPS)
 
@@ -72,11 +67,8 @@ def find_asset(folder: Path) -> Path:
     """Return the path of the asset of the run in ``folder``. Raises ``UserError`` if it has none yet."""
     ply = folder / ASSET
     if not has_file(ply):
-        line = f"cadam3d train {setting_word('resume', shown(folder))}"
-        # A run that has finished without the file was asked for other formats, or for none.
-        if read_summary(folder).get("outcome") == Outcome.FINISHED:
-            line += " 'exporter=[ply]'"
-        raise UserError(f"{shown(folder)}: has no {ASSET} yet. Try: {line}")
+        line = f"{setting_word('resume', shown(folder))} 'exporter=[ply]'"
+        raise UserError(f"{shown(folder)}: has no {ASSET} yet. Try: cadam3d train {line}")
     return ply
 
 
@@ -91,18 +83,13 @@ def find_run(text: str) -> Path:
     folder = typed_path(text)
     if has_file(folder, CONFIG):
         return folder
-    example = f"run={LATEST}"
     if not os.path.lexists(folder):
         reason = "no such folder"
-    elif has_file(folder):
-        reason = "it is a file"
     elif is_sweep(folder):
         reason = "it is a sweep, which has many runs"
-        started = [config.parent for config in sorted(folder.glob(f"*/{CONFIG}"))]
-        example = setting_word("run", shown(started[0])) if started else example
     else:
         reason = f"it has no {CONFIG}"
-    raise UserError(f"run: expected the folder of a run, got {text!r} ({reason}). Try: {example}")
+    raise UserError(f"run: expected the folder of a run, got {text!r} ({reason}). Try: run={LATEST}")
 
 
 def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:

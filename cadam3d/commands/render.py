@@ -1,6 +1,5 @@
 """``cadam3d render``: make pictures or videos of an asset, or of several runs side by side."""
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -37,8 +36,7 @@ def run(cfg: DictConfig, _call: Call) -> None:
             raise UserError("labels: expected null for a single asset, which has no label. Try: labels=null")
         asset = open_asset(cfg)
         outputs, of = export(cfg, asset, "render", has_record=False), f"{len(asset.gaussians)} Gaussians"
-    files = "1 file" if len(outputs) == 1 else f"{len(outputs)} files"
-    print(f"{files} of {of}" if OmegaConf.is_list(cfg.run) else f"{files} of {of}:")
+    print(f"{len(outputs)} file(s) of {of}:")
     for output in outputs:
         print(f"  {shown(output.path)}")
 
@@ -48,11 +46,7 @@ def _compare(cfg: DictConfig) -> tuple[list[Output], list[Subject]]:
     if cfg.ply is not None:
         raise UserError("run, ply: expected one of them, got both. Try: ply=null")
     if not 2 <= len(cfg.run) <= MOST_RUNS:
-        some = [str(text) for text in cfg.run[:MOST_RUNS]]
-        line = f"run=[{','.join(some)}]" if len(some) > 1 else f"run={(some or [LATEST])[0]}"
-        raise fail(
-            "run", expected=f"2 to {MOST_RUNS} runs in a list", got=len(cfg.run), example=shlex.quote(line)
-        )
+        raise fail("run", expected=f"2 to {MOST_RUNS} runs", got=len(cfg.run), example=f"run={LATEST}")
     folders = [find_run(str(text)) for text in cfg.run]
     labels = default_labels(folders) if cfg.labels is None else [plain(label) for label in cfg.labels]
     if len(labels) != len(folders) or not all(0 < len(label) <= LONGEST_LABEL for label in labels):

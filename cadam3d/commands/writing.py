@@ -17,13 +17,10 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.exporter.base import Exporter, suffix_in
 from cadam3d.io.run_folder import (
     expanded,
-    has_file,
     nearest_existing,
-    numbered,
+    not_writable,
     remove_empty,
     require_writable,
-    setting_word,
-    shown,
     spare,
     typed_path,
 )
@@ -96,16 +93,12 @@ def write_files(
         if output is not None and names_file(text):
             return [_one_file(target, into_file)]
         if os.path.lexists(target) and not target.is_dir():
-            line = setting_word("output", numbered(target.with_name(target.stem), first=1))
-            raise UserError(f"output: expected a folder, got {text!r}, which is a file. Try: {line}")
+            raise fail("output", expected="a folder", got=text, example=f"output={name}")
         existing = nearest_existing(target)
         target.mkdir(parents=True, exist_ok=True)
         require_writable(target)
     except OSError as error:
-        place = nearest_existing(target.parent)
-        reason = f"{shown(place)} is a file" if has_file(place) else error.strerror or error
-        line = setting_word("output", spare(name))
-        raise UserError(f"output: cannot write to {target} ({reason}). Try: {line}") from error
+        raise not_writable("output", target, error) from error
     try:
         return into_folder(target)
     finally:
@@ -124,12 +117,9 @@ def _one_file(target: Path, write: WriteFn) -> Output:
             outputs = write(Path(folder))
             suffixes = sorted({suffix_in(output.path.name) for output in outputs})
             if len(outputs) != 1 or not target.name.lower().endswith(suffixes[0]):
-                line = setting_word("output", f"{numbered(target.with_name(target.stem), first=1)}/")
-                raise UserError(
-                    f"output: expected the name of a folder, got {str(target)!r}, because "
-                    f"exporter=[{','.join(dict.fromkeys(output.name for output in outputs))}] writes "
-                    f"{len(outputs)} file(s) with suffix {'|'.join(suffixes)}. Try: {line}"
-                )
+                expected = f"a folder, because {len(outputs)} file(s) with {'|'.join(suffixes)} are written"
+                example = f"output={target.stem}/"
+                raise fail("output", expected=expected, got=str(target), example=example)
             return replace(outputs[0], path=outputs[0].path.replace(target))
     finally:
         remove_empty(target.parent, existing)

@@ -102,34 +102,6 @@ PROGRAMS: tuple[Program, ...] = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Unknown:
-    """A program that people ask for, with axes that are neither measured nor documented by the program."""
-
-    reason: str  # why for= does not offer it
-    words: tuple[str, ...]  # what to try
-
-
-UNKNOWN: Mapping[str, Unknown] = {
-    "cesium": Unknown(
-        reason="CesiumJS documents Gaussians in 3D Tiles, not in a single file",
-        words=("exporter=[glb]",),
-    ),
-    "comfyui": Unknown(
-        reason="ComfyUI documents which formats it reads, but not their axes",
-        words=("exporter=[ply]", "exporter.ply.up=+y"),
-    ),
-    "unity": Unknown(
-        reason="packages for Unity differ in their axes, and some mirror the object",
-        words=("exporter=[ply]", "exporter.ply.up=+y", "exporter.ply.pad_sh=3"),
-    ),
-    "unreal": Unknown(
-        reason="Epic documents which formats it imports, but not their axes",
-        words=("exporter=[ply]", "exporter.ply.up=-y"),
-    ),
-}
-
-
 def shown_as(exporter: str, up: str) -> dict[str, list[Program]]:
     """Return the programs that read a file of ``exporter``, by how they show it if its up axis is ``up``.
 

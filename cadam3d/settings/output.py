@@ -1,6 +1,5 @@
 """Output: which exporter writes the file that ``output=NAME.SUFFIX`` names."""
 
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -9,7 +8,6 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.exporter.base import Exporter, exporters_by_suffix
-from cadam3d.exporter.programs import PROGRAMS, UNKNOWN
 from cadam3d.io.run_folder import expanded, setting_word
 from cadam3d.settings.line import is_list, key_of, text_of
 from cadam3d.settings.options import option_class, option_names
@@ -83,16 +81,11 @@ def _options(override: str) -> set[str]:
 
 
 def _require_target(target: str, *, is_alone: bool) -> None:
-    """Raise ``UserError`` for a program with unknown axes, or if the line also names an exporter.
+    """Raise ``UserError`` if the line also names an exporter.
 
     A program decides which exporter is right. A setting of that exporter, such as ``exporter.glb.up=-y``, is
     a deliberate change and stays.
     """
-    if target in UNKNOWN:
-        known = "|".join(sorted(program.target for program in PROGRAMS))
-        expected = f"a program whose axes are known ({known})"
-        got, example = f"{target}: {UNKNOWN[target].reason}", shlex.join(UNKNOWN[target].words)
-        raise UserError(f"for: expected {expected}, got {got}. Try: {example}")
     if not is_alone:
         expected = f"for={target} alone, which chooses the exporter"
         raise UserError(f"exporter: expected {expected}, got both. Try: for={target}")

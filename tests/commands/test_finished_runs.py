@@ -85,7 +85,7 @@ def test_render_writes_numbered_images_and_nothing_else(run_folder, type_line, t
     names = sorted(path.name for path in (run_folder / "render/images").iterdir())
     assert names[:2] == ["000_az000_el+00.png", "001_az120_el+00.png"]
     assert len(names) == 6
-    assert "6 files of 6 Gaussians" in out
+    assert "6 file(s) of 6 Gaussians" in out
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a run"]
 
 
@@ -359,8 +359,8 @@ def test_runs_with_equal_densifiers_are_labelled_by_their_folders_and_equal_fold
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("run=[b]",), "run: expected 2 to 12 runs in a list, got 1. Try: run=b"),
-        (("run=[]",), "run: expected 2 to 12 runs in a list, got 0. Try: run=outputs/latest"),
+        (("run=[b]",), "run: expected 2 to 12 runs, got 1. Try: run=outputs/latest"),
+        (("run=[]",), "run: expected 2 to 12 runs, got 0. Try: run=outputs/latest"),
         (("run=[b,nowhere]",), "run: expected the folder of a run, got 'nowhere' (no such folder). Try: "),
         (
             ("run=[b,b]", "labels=[a]"),
