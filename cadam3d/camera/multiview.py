@@ -50,7 +50,6 @@ class Multiview(CameraSampler):
             "camera.relative_distance",
             expected=f"at least {least:.3g} at {self.fov_y_deg[1]:g} degrees, outside the unit ball",
             got=self.relative_distance,
-            example="'camera.relative_distance=[0.8,1]' 'camera.fov_y_deg=[15,60]'",
         )
 
     def check_views(self, views: int) -> None:
@@ -60,7 +59,7 @@ class Multiview(CameraSampler):
             "views",
             expected=f"a multiple of {GROUP}, since camera=multiview draws groups of {GROUP} views",
             got=views,
-            example=f"views={GROUP * max(round(views / GROUP), 1)}",
+            example=f"views={GROUP}",
         )
 
     def sample(self, step: int, views: int, generator: torch.Generator) -> Cameras:

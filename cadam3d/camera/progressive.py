@@ -77,15 +77,13 @@ class Progressive(CameraSampler):
 
     def __post_init__(self) -> None:
         require_size(self.size)
-        for name in ("azimuth_deg", "elevation_deg", "distance", "fov_y_deg"):
-            _require_widening(f"camera.{name}", getattr(self, name))
         for side in ("start", "end"):
             turn, rise = getattr(self.azimuth_deg, side), getattr(self.elevation_deg, side)
             require_interval(f"camera.azimuth_deg.{side}", turn, low=-360, high=360)
             require_interval(f"camera.elevation_deg.{side}", rise, low=-90, high=90)
             require_lens(getattr(self.distance, side), getattr(self.fov_y_deg, side), f".{side}")
         for name in ("azimuth_deg", "elevation_deg", "distance", "fov_y_deg"):
-            _require_motion(f"camera.{name}", getattr(self, name))
+            _require_widening(f"camera.{name}", getattr(self, name))
         require_whole("camera.begin", self.begin, low=0)
         require_whole("camera.every", self.every, low=1)
         require_range("camera.gamma", self.gamma, above=0)
@@ -128,28 +126,11 @@ class Progressive(CameraSampler):
         return (low + high) / 2 + (high - low) / 2 * side.sign() * side.abs() ** self.gamma
 
 
-def _require_widening(key: str, value: object) -> None:
-    is_one = isinstance(value, Widening)
-    example = (
-        f"'{key}={{_target_: {Widening.__module__}.Widening, start: [10,20], end: [5,20], factor: [0.9,1]}}'"
-    )
-    require(is_one, key, expected="a range with start, end and factor", got=value, example=example)
-    assert isinstance(value, Widening)
+def _require_widening(key: str, value: Widening) -> None:
+    is_factor = are_numbers(value.factor, low=1e-3, high=1e3) and len(value.factor) == 2
     require(
-        are_numbers(value.factor, low=1e-3, high=1e3) and len(value.factor) == 2,
+        is_factor and value.reaches_its_end(),
         f"{key}.factor",
-        expected="two numbers > 0, for the low and the high end",
+        expected=f"two positive factors that lead from {value.start} to {value.end}",
         got=value.factor,
-        example=f"'{key}.factor=[0.75,1.1]'",
-    )
-    require_range(f"{key}.about", value.about)
-
-
-def _require_motion(key: str, value: Widening) -> None:
-    require(
-        value.reaches_its_end(),
-        f"{key}.factor",
-        expected=f"factors that lead from {value.start} to {value.end}, or a fixed range",
-        got=value.factor,
-        example=f"'{key}.end=[{value.start[0]:g},{value.start[1]:g}]' '{key}.factor=[1,1]'",
     )

@@ -11,7 +11,6 @@ import ctypes
 import hashlib
 import os
 import platform
-import shlex
 import shutil
 import subprocess
 import sys
@@ -26,7 +25,7 @@ from pathlib import Path
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.cache import make_private, other_writers
-from cadam3d.io.run_folder import spare, typed_path
+from cadam3d.io.run_folder import typed_path
 
 # A header that libraries may include: vectors of the width of this machine.
 SIMD = Path(__file__).parent / "simd.h"
@@ -63,7 +62,6 @@ class Names:
 
     key: str  # the setting that needs it, as in "rasterizer=cpu"
     fallback: str  # what to type to do without it
-    cache_key: str | None = None  # the setting for the folder of compiled files, if there is one
 
 
 @dataclass(frozen=True)
@@ -132,7 +130,7 @@ def build(
     if compiler is None:
         raise UserError(
             f"{library.names.key}: expected a C++ compiler ($CXX, c++, g++ or clang++) to build the kernels "
-            "once, got none. `apt install g++` or `xcode-select --install` installs one, and so does pip. "
+            "once, got none. "
             "Try: pip install 'cadam3d[compiler]'"
         )
     start = time.perf_counter()
@@ -159,7 +157,7 @@ def own_folder(cache_dir: Path, names: Names) -> Path:
     if reason:
         raise UserError(
             f"{names.key}: expected a folder for compiled kernels that no other user can write, got "
-            f"{folder} ({reason}). Try: {another_cache(names)}"
+            f"{folder} ({reason}). Try: {names.fallback}"
         )
     return folder
 
@@ -193,19 +191,8 @@ def build_folder(cache_dir: Path, names: Names) -> Iterator[Path]:
     except OSError as error:
         raise UserError(
             f"{names.key}: expected a folder for compiled kernels that can be written, got {cache_dir} "
-            f"({error}). Try: {another_cache(names)}"
+            f"({error}). Try: {names.fallback}"
         ) from error
-
-
-def another_cache(names: Names) -> str:
-    """Return the words that put compiled files in a new folder for temporary files, or that avoid them.
-
-    They contain the key too, because ``rasterizer=auto`` has no ``cache_dir``.
-    """
-    if names.cache_key is None:
-        return names.fallback
-    folder = spare("cadam3d-kernels")
-    return f"{names.key} {shlex.quote(f'{names.cache_key}={folder}')}"
 
 
 def short_hash(content: str | bytes) -> str:

@@ -16,7 +16,6 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.points import (
     FromObject,
     PointCloud,
-    another_file,
     found_file,
     one_color,
     points_on_surface,
@@ -67,7 +66,7 @@ class Mesh(FromObject):
 
     def _load(self) -> list[trimesh.Trimesh]:
         """Return the surfaces of the file, each at its place in the scene and with its own colours."""
-        path = found_file(self.path, "mesh", SUFFIXES)
+        path = found_file(self.path)
         # Every format has its own parser, with its own exceptions.
         try:
             scene = trimesh.load_scene(path)
@@ -76,10 +75,9 @@ class Mesh(FromObject):
                     _keep_vertex_light(geometry)
             parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
         except Exception as error:
-            reason = str(error) or type(error).__name__
             raise UserError(
-                f"initializer.path: expected a PLY, OBJ, STL, GLB or OFF file, got {self.path!r}, which "
-                f"cannot be read ({reason}). Try: {another_file(self.path, 'mesh', SUFFIXES)}"
+                f"initializer.path: expected a file with a mesh ({', '.join(SUFFIXES)}), got {self.path!r}, "
+                f"which cannot be read ({str(error) or type(error).__name__})."
             ) from error
         is_finite = all(np.isfinite(part.vertices).all() for part in parts)
         if not is_finite or sum(float(part.area) for part in parts) <= 0:

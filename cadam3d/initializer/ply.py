@@ -1,7 +1,6 @@
 """Ply: starts from a file of Gaussians, or from a PLY file with a cloud of coloured points."""
 
 import math
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,20 +8,19 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_choice, require_color, require_whole
+from cadam3d.core.checks import require, require_choice, require_color, require_whole, unless_none
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.points import (
     FromObject,
     PointCloud,
-    another_file,
     found_file,
     one_color,
     replicated,
     require_copies,
     rows_of,
 )
-from cadam3d.io.asset_file import PLY, SUFFIXES, file_format, read_gaussians
+from cadam3d.io.asset_file import PLY, file_format, read_gaussians
 from cadam3d.io.frames import UPS, points_to_world, turned, turned_points
 from cadam3d.io.ply import holds_gaussians, read_points
 from cadam3d.io.ply_tables import read_header
@@ -52,8 +50,7 @@ class Ply(FromObject):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.count is not None:
-            require_whole("initializer.count", self.count, low=1)
+        unless_none(require_whole, "initializer.count", self.count, low=1)
         if self.up is not None:
             require_choice("initializer.up", self.up, UPS)
         require_copies(self.replicate, self.replicate_radius, self.replicate_law)
@@ -64,7 +61,7 @@ class Ply(FromObject):
 
         Raises ``UserError`` if the file is missing, cannot be read or holds neither.
         """
-        path = found_file(self.path, "ply", SUFFIXES)
+        path = found_file(self.path)
         if file_format(path) == PLY and not holds_gaussians(path):
             return self._cloud(path, generator, device)
         return self._asset(path, generator).to(device)
@@ -103,7 +100,7 @@ class Ply(FromObject):
         if any(element.name in SURFACES and element.count for element in header.elements):
             raise UserError(
                 f"initializer.path: expected a file of Gaussians or points, got {self.path!r}, which is a "
-                f"mesh. Try: {shlex.join(['initializer=mesh', f'initializer.path={self.path}'])}"
+                "mesh. Try: initializer=mesh"
             )
         positions, rgb = read_points(header)
         points = torch.from_numpy(positions)
@@ -112,13 +109,8 @@ class Ply(FromObject):
 
 
 def _require_finite(path: Path, name: str, rows: Tensor) -> None:
-    bad = int((~rows.isfinite()).reshape(len(rows), -1).any(dim=1).sum()) if len(rows) else 0
-    if bad or len(rows) == 0:
-        what = f"has {name} that are not finite ({bad} of {len(rows)})" if bad else "is empty"
-        raise UserError(
-            f"initializer.path: expected a file of Gaussians or points, got {str(path)!r}, which {what}. "
-            f"Try: {another_file(str(path), 'ply', SUFFIXES)}"
-        )
+    is_usable = len(rows) > 0 and bool(rows.isfinite().all())
+    require(is_usable, "initializer.path", expected=f"finite {name} in the file", got=str(path))
 
 
 def _with_degree(sh: Tensor, degree: int) -> Tensor:

@@ -1,9 +1,7 @@
 """From coloured points to Gaussians: what the initializers share that start from points or from an object."""
 
-import difflib
 import math
 import os
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +11,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from cadam3d.core.checks import fail, require, require_choice, require_range, require_whole
+from cadam3d.core.checks import fail, require, require_choice, require_range, require_whole, unless_none
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import require_memory
 from cadam3d.core.sh import MAX_DEGREE, rgb_to_sh0
@@ -71,8 +69,7 @@ class FromPoints(Initializer):
     sh_degree: int | None  # 0 to 3
 
     def __post_init__(self) -> None:
-        if self.scale is not None:
-            require_range("initializer.scale", self.scale, above=0)
+        unless_none(require_range, "initializer.scale", self.scale, above=0)
         require_choice("initializer.scale_law", self.scale_law, SCALE_LAWS)
         require_range("initializer.opacity", self.opacity, above=0, below=1)
         require_whole("initializer.sh_degree", self.sh_degree or 0, low=0, high=MAX_DEGREE)
@@ -97,8 +94,7 @@ class FromObject(FromPoints):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_choice("initializer.turn_deg", self.turn_deg, TURNS)
-        if self.radius is not None:
-            require_range("initializer.radius", self.radius, above=0, high=1)
+        unless_none(require_range, "initializer.radius", self.radius, above=0, high=1)
         if self.factor is not None:
             require_range("initializer.factor", self.factor, above=0, high=1000)
             require(
@@ -258,29 +254,13 @@ def fit(points: Float[Tensor, "n 3"], radius: float | None) -> tuple[Float[Tenso
     return center, radius / farthest if farthest > 0 else 1.0
 
 
-def found_file(path: str, option: str, suffixes: Sequence[str]) -> Path:
+def found_file(path: str) -> Path:
     """Return the path that ``initializer.path`` names. Raises ``UserError`` unless it is a file."""
     found = Path(path).expanduser()
     # Unlike Path.is_file, this is False for names that the system refuses, such as one that is too long.
-    if not os.path.isfile(found):  # noqa: PTH113
-        example = another_file(path, option, suffixes)
-        raise fail("initializer.path", expected="a file", got=path, example=example)
+    is_file = os.path.isfile(found)  # noqa: PTH113
+    require(is_file, "initializer.path", expected="a file", got=path, example="initializer.path=FILE")
     return found
-
-
-def another_file(path: str, option: str, suffixes: Sequence[str]) -> str:
-    """Return what to type instead of a file that initializer=``option`` cannot read.
-
-    This is the file with the nearest name and one of ``suffixes`` in the same folder, or else the help of the
-    option.
-    """
-    wrong = Path(path).expanduser()
-    files = sorted(wrong.parent.iterdir()) if os.path.isdir(wrong.parent) else []  # noqa: PTH112
-    names = [file.name for file in files if file.suffix.lower() in suffixes and file != wrong]
-    near = difflib.get_close_matches(wrong.name, names, n=1, cutoff=0.0)
-    if not near:
-        return f"cadam3d train --help initializer={option}"
-    return shlex.quote(f"initializer.path={wrong.parent / near[0]}")
 
 
 def require_count(count: int, sh_degree: int | None) -> None:
@@ -296,6 +276,5 @@ def require_count(count: int, sh_degree: int | None) -> None:
 def require_copies(replicate: int, replicate_radius: object, replicate_law: object) -> None:
     """Raise ``UserError`` unless ``replicate`` is at least 1, its radius in (0, 1] and its law known."""
     require_whole("initializer.replicate", replicate, low=1)
-    require_memory("initializer.replicate", replicate, unit=16 * 14)
     require_range("initializer.replicate_radius", replicate_radius, above=0, high=1)
     require_choice("initializer.replicate_law", replicate_law, REPLICATE_LAWS)

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from kornia.color import linear_rgb_to_rgb
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_choice, require_color, require_range, require_whole
+from cadam3d.core.checks import require_choice, require_color, require_range, require_whole, unless_none
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import require_memory
@@ -77,28 +77,17 @@ class ShapE(FromObject):
         super().__post_init__()
         self._source()
         require_choice("initializer.dtype", self.dtype, ("auto", *DTYPES))
-        is_text = self.prompt is None or (isinstance(self.prompt, str) and self.prompt.strip() != "")
-        example = "initializer.prompt=null"
-        require(is_text, "initializer.prompt", expected="text or null", got=self.prompt, example=example)
         require_whole("initializer.steps", self.steps, low=1, high=1024)
         require_range("initializer.guidance_scale", self.guidance_scale, low=1)
         require_whole("initializer.grid_size", self.grid_size, low=2)
         require_memory("initializer.grid_size", self.grid_size, unit=4, power=3)
         require_count(1 if self.count is None else self.count, self.sh_degree)
         require_whole("initializer.grow_points", self.grow_points, low=0)
-        require_memory("initializer.grow_points", self.grow_points, unit=12)
         require_range("initializer.grow_distance", self.grow_distance, above=0)
         require_range("initializer.grow_noise", self.grow_noise, low=0, high=1)
         require_choice("initializer.tone", self.tone, TONES)
-        if self.color is not None:
-            require_color("initializer.color", self.color)
+        unless_none(require_color, "initializer.color", self.color)
         require_copies(self.replicate, self.replicate_radius, self.replicate_law)
-        require(
-            self.fallback is None or hasattr(self.fallback, "begin"),
-            "initializer.fallback",
-            expected="an initializer or null",
-            got=self.fallback,
-        )
 
     def begin(self, prompt: str, generator: torch.Generator, device: torch.device) -> Beginning:
         """Return the Gaussians of Shap-E, or those of ``fallback`` with a note if Shap-E fails.
@@ -114,8 +103,8 @@ class ShapE(FromObject):
             # Rewind, so that the run equals one that was started with the fallback.
             generator.set_state(before)
             instead = self.fallback.begin(prompt, generator, device)
-            note = f"{type(self.fallback).__name__} is used instead of Shap-E. {error}"
-            return Beginning(instead.gaussians, f"{note} {instead.note}" if instead.note else note)
+            name = type(self.fallback).__name__
+            return Beginning(instead.gaussians, f"{name} is used instead of Shap-E. {error}")
 
     def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
         """Return Gaussians on ``device`` at points of the generated mesh.

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
-from cadam3d.core.checks import require_choice, require_whole
+from cadam3d.core.checks import fail, require_choice, require_whole, unless_none
 from cadam3d.core.errors import UserError
 from cadam3d.core.rendering import Truth
 from cadam3d.prior.base import DiffusionPrior
@@ -63,8 +63,7 @@ class ShapesTruth(TruthSource):
 
     def __post_init__(self) -> None:
         require_whole("truth.samples_per_pixel", self.samples_per_pixel, low=1, high=8)
-        if self.turns is not None:
-            require_whole("truth.turns", self.turns, low=2, high=MOST_TURNS)
+        unless_none(require_whole, "truth.turns", self.turns, low=2, high=MOST_TURNS)
         require_choice("truth.tracer", self.tracer, TRACERS)
 
     def of(self, prompt: str, prior: DiffusionPrior) -> Truth:
@@ -77,9 +76,6 @@ class ShapesTruth(TruthSource):
         try:
             scene = build(prompt)
         except UserError as error:
-            reason = str(error).removeprefix("prompt: ").partition(" Try: ")[0].removesuffix(".")
-            raise UserError(
-                "truth: expected a prompt of the embedded world, which truth=shapes draws, got another one "
-                f"({reason}). Try: truth=prior"
-            ) from error
+            expected = "a prompt of the embedded world, which truth=shapes draws"
+            raise fail("truth", expected=expected, got=prompt, example="truth=prior") from error
         return true_scene(scene, self.samples_per_pixel, self.turns, self.tracer)

@@ -19,7 +19,7 @@ from cadam3d.rasterizer.base import KERNELS, Backend, Rasterizer, definitions
 from cadam3d.rasterizer.native import RenderPass, require_shapes, run_pass
 
 SOURCES = (KERNELS / "cpu.cpp", KERNELS / "splat_math.h", SIMD)
-NAMES = Names("rasterizer=cpu", fallback="rasterizer=reference", cache_key="rasterizer.cache_dir")
+NAMES = Names("rasterizer=cpu", fallback="rasterizer=reference")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from cadam3d.compiled.library import Names, build_folder, find_intact, keep, own
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer.base import KERNELS, definitions
 
-NAMES = Names("rasterizer=cuda", fallback="rasterizer=reference", cache_key="rasterizer.cache_dir")
+NAMES = Names("rasterizer=cuda", fallback="rasterizer=reference")
 SOURCE = "cuda.cu"
 HEADERS = ("blend.cuh", "device.cuh", "project.cuh", "sort.cuh", "splat_math.h", "tiles.cuh")
 OPTIONS = (

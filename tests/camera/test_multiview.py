@@ -68,11 +68,11 @@ def test_opposite_views_look_at_each_other():
     torch.testing.assert_close((position[0] * position[1]).sum(), torch.tensor(0.0), atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize(("views", "hint"), [(1, 4), (2, 4), (5, 4), (6, 8), (7, 8), (10, 8)])
-def test_an_incomplete_group_is_refused_with_a_number_that_works(views, hint):
+@pytest.mark.parametrize("views", [1, 2, 5, 10])
+def test_an_incomplete_group_is_refused(views):
     for call in (lambda: sample(views), lambda: Multiview(**PUBLISHED).check_views(views)):
         with pytest.raises(
-            UserError, match=rf"^views: expected a multiple of 4.*got {views}\. Try: views={hint}$"
+            UserError, match=rf"^views: expected a multiple of 4.*got {views}\. Try: views=4$"
         ):
             call()
 

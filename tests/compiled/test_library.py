@@ -26,7 +26,7 @@ from cadam3d.compiled.library import (
 )
 from cadam3d.core.errors import UserError
 
-NAMES = Names("rasterizer=cpu", fallback="rasterizer=reference", cache_key="rasterizer.cache_dir")
+NAMES = Names("rasterizer=cpu", fallback="rasterizer=reference")
 SOURCE = (
     '#include "answer.h"\nextern "C" __attribute__((visibility("default"))) int test() { return ANSWER; }\n'
 )
@@ -175,7 +175,7 @@ def test_simpler_flags_are_used_if_the_native_ones_fail(library, fake_compiler, 
 def test_a_folder_that_cannot_be_written_is_reported_with_its_key(library, fake_compiler, tmp_path):
     fake_compiler()
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match=r"rasterizer\.cache_dir="):
+    with pytest.raises(UserError, match=r"rasterizer=cpu: expected a folder .* that can be written"):
         build(library, tmp_path / "file")
 
 
@@ -201,14 +201,12 @@ def test_a_file_that_another_user_can_write_is_not_loaded(cached):
 
 
 @pytest.mark.parametrize("mode", [0o720, 0o702, 0o777, 0o1777])
-def test_a_folder_that_another_user_can_write_is_refused_with_what_to_type(library, mode, cached):
+def test_a_folder_that_another_user_can_write_is_refused(library, mode, cached):
     assert own_folder(cached.parent, NAMES) == cached.parent
     cached.parent.chmod(mode)
     for call in (lambda: own_folder(cached.parent, NAMES), lambda: build(library, cached.parent)):
-        with pytest.raises(UserError, match="no other user can write") as caught:
+        with pytest.raises(UserError, match=r"no other user can write.* Try: rasterizer=reference$"):
             call()
-        advice = "rasterizer.cache_dir="
-        assert f"Try: {advice}" in str(caught.value).replace("rasterizer=cpu rasterizer.", "rasterizer.")
 
 
 @pytest.mark.parametrize("place", ["folder", "file"])

@@ -149,7 +149,7 @@ def test_gaussians_are_not_replicated(tmp_path):
 
 
 def test_an_empty_asset_is_refused(tmp_path):
-    with pytest.raises(UserError, match=r"which is empty\. Try: cadam3d train --help initializer=ply$"):
+    with pytest.raises(UserError, match=r"^initializer\.path: expected finite means"):
         build(saved(tmp_path, some_gaussians(n=0)))
 
 
@@ -228,13 +228,13 @@ def test_results_depend_on_the_generator_alone(tmp_path):
 def test_points_that_are_not_finite_are_refused(tmp_path):
     path = point_cloud(tmp_path, "ascii")
     path.write_text(path.read_text().replace(str(POINTS.tolist()[0][0]), "nan"))
-    with pytest.raises(UserError, match=r"which has points that are not finite \(1 of 40\)"):
+    with pytest.raises(UserError, match=r"^initializer\.path: expected finite points"):
         build(path)
 
 
 def test_a_mesh_is_refused_with_the_initializer_to_use(tmp_path):
     trimesh.creation.box().export(tmp_path / "box.ply")
-    with pytest.raises(UserError, match=r"which is a mesh\. Try: initializer=mesh initializer\.path=.*box"):
+    with pytest.raises(UserError, match=r"which is a mesh\. Try: initializer=mesh$"):
         build(tmp_path / "box.ply")
 
 

@@ -152,12 +152,6 @@ def test_a_surface_is_covered_in_proportion_to_its_area():
 
 
 @pytest.mark.parametrize("name", [".", "absent.ply", "x" * 5000, "null\0byte"])
-def test_a_path_that_is_no_file_is_refused_with_the_nearest_one(tmp_path, monkeypatch, name):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match=r"initializer\.path: expected a file, .* --help initializer=ply$"):
-        found_file(name, "ply", [".ply"])
-    (tmp_path / "another.ply").touch()
-    with pytest.raises(
-        UserError, match=r"initializer\.path: expected a file, .* initializer\.path=another\.ply$"
-    ):
-        found_file("anoter.ply", "ply", [".ply"])
+def test_a_path_that_is_no_file_is_refused(name):
+    with pytest.raises(UserError, match=r"^initializer\.path: expected a file"):
+        found_file(name)
