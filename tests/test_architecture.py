@@ -148,43 +148,15 @@ def test_imports_point_down(path):
     ("importer", "target"),
     [
         ("core", ("io", "ply")),
-        ("densifier", ("prior", "base")),
-        ("exporter", ("rasterizer", "base")),
         ("guidance", ("prior", "tiny")),
         ("trainer", ("densifier", "cadam")),
-        ("trainer", ("callback", "metrics")),
-        ("io", ("trainer",)),
-        ("state", ("callback", "base")),
-        ("camera", ("settings",)),
         ("settings", ("sweep", "folder")),
         ("sweep", ("report",)),
-        ("sweep", ("launch",)),
-        ("sweep", ("commands", "train")),
-        ("sweep", ("cli",)),
-        ("report", ("commands", "asset")),
         ("commands", ("launch",)),
-        ("launch", ("cli",)),
     ],
 )
 def test_an_upward_or_sideways_import_is_noticed(importer, target):
     assert arrow_problem(importer, target) is not None
-
-
-@pytest.mark.parametrize(
-    ("importer", "target"),
-    [
-        ("io", ("core", "gaussians")),
-        ("guidance", ("prior", "path")),
-        ("trainer", ("densifier", "base")),
-        ("callback", ("state",)),
-        ("commands", ("prior", "shapes")),
-        ("sweep", ("settings", "line")),
-        ("report", ("sweep", "folder")),
-        ("launch", ("sweep", "plan")),
-    ],
-)
-def test_a_downward_import_is_allowed(importer, target):
-    assert arrow_problem(importer, target) is None
 
 
 def test_no_files_import_each_other_in_a_circle():
@@ -216,13 +188,6 @@ def test_a_planted_circle_is_noticed(lines, tmp_path):
 
 def test_hydra_is_imported_on_the_upper_floors_only():
     assert not [path for path in sources() if FLOORS[part_of(path)] < HYDRA_FLOOR and imports_hydra(path)]
-
-
-def test_an_import_of_hydra_is_noticed(tmp_path):
-    for line in ("import hydra", "from omegaconf.errors import OmegaConfBaseException"):
-        path = tmp_path / "planted.py"
-        path.write_text(f"def run():\n    {line}\n", encoding="utf-8")
-        assert imports_hydra(path, tmp_path)
 
 
 def imports_hydra(path: Path, package: Path = PACKAGE) -> bool:
@@ -392,11 +357,6 @@ def test_outside_of_components_no_file_name_exists_twice():
 
 def test_nothing_is_imported_by_star():
     assert not [path for path in sources() for _, names in imports(path) if "*" in names]
-
-
-def test_no_folder_is_called_utils():
-    names = {part for path in sources() for part in path.relative_to(PACKAGE).with_suffix("").parts}
-    assert not names & {"utils", "util", "helpers", "misc", "common"}
 
 
 def test_no_module_level_future_annotations():

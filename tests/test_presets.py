@@ -88,17 +88,6 @@ def test_mvdream_starts_inside_the_image():
     assert float(shape(component(cfg.initializer)).means.norm(dim=1).max()) <= 0.9 + 0.1
 
 
-@pytest.mark.parametrize("recipe", ["gaussiandreamer", "luciddreamer", "mvdream"])
-def test_a_smaller_count_reaches_the_fallback(recipe):
-    words = ["prompt=a red cube", f"experiment={recipe}"]
-    usual = 100_000 if recipe == "gaussiandreamer" else 81_920
-    assert compose(words).initializer.fallback.count == usual
-    fewer = compose([*words, "initializer.count=30"]).initializer
-    assert fewer.fallback.count == 30 * fewer.replicate
-    if recipe != "gaussiandreamer":
-        assert compose([*words, "initializer.count=null"]).initializer.fallback.count == usual
-
-
 def test_flowdreamer_has_the_lengths_of_luciddreamer():
     lucid, flow = build("refine", "lucid"), build("refine", "flowdreamer")
     assert {key for key, value in vars(lucid).items() if value != vars(flow)[key]} == {"end", "reset_until"}
@@ -133,11 +122,6 @@ def test_resets_are_at_the_published_steps_after_the_warm_up(name, resets):
     assert [step for step in range(1, 5001) if refine.resets_at(step)] == list(resets)
 
 
-def test_luciddreamers_own_baseline_resets_from_step_300_on():
-    refine = build("refine", "lucid", "refine.reset_from=300")
-    assert next(step for step in range(1, 5001) if refine.resets_at(step)) == 300
-
-
 def test_rates_fall_to_their_published_ends():
     lucid = build("optimizer", "lucid", "steps=5000")
     assert lucid.learning_rates(0) == pytest.approx(
@@ -148,12 +132,6 @@ def test_rates_fall_to_their_published_ends():
     )
 
 
-@pytest.mark.parametrize("family", UNITS)
-def test_higher_coefficients_learn_twenty_times_as_slowly_as_in_3dgs(family):
-    rates = build("optimizer", family).learning_rates(0)
-    assert rates["sh_rest"] == pytest.approx(rates["sh_dc"] / 20)
-
-
 def test_cameras_change_at_the_same_share_of_a_run_of_any_length():
     lucid = {steps: build("camera", "progressive", f"steps={steps}") for steps in (5000, 400)}
     assert (lucid[5000].begin, lucid[5000].every) == (500, 500)
@@ -162,12 +140,6 @@ def test_cameras_change_at_the_same_share_of_a_run_of_any_length():
         size = build("camera", "dreamgaussian", f"steps={steps}").size
         assert list(size.milestones) == milestones
         assert [size(step) for step in (0, *milestones)] == [128, 256, 512]
-
-
-def test_the_stages_of_dreamgaussians_images_can_be_smaller():
-    small = build("camera", "dreamgaussian", "steps=100", "camera.size.values=[16,32,64]")
-    assert [small.sample(step, 1, torch.Generator()).height for step in (0, 30, 60)] == [16, 32, 64]
-    assert build("camera", "dreamgaussian", "camera.size=64").size == 64
 
 
 def test_flowdreamers_cameras_are_its_codes_defaults_and_its_head_can_be_typed():

@@ -11,7 +11,6 @@ from omegaconf import OmegaConf
 from cadam3d.build import component
 from cadam3d.core.schedule import as_schedule
 from cadam3d.densifier.refine import Refine
-from cadam3d.io.jsonl import read_json
 from cadam3d.settings.compose import compose, parts
 
 PROMPT = "prompt=a red cube"
@@ -118,19 +117,3 @@ def test_recovery_is_long_enough_for_a_reset_opacity_to_reach_half():
     cfg = compose([PROMPT])
     logit = torch.tensor(cfg.refine.reset_value).logit().item()
     assert -logit / cfg.optimizer.opacity_lr <= cfg.refine.recovery
-
-
-def test_a_reset_that_the_rule_skips_would_have_spoiled_the_result(type_line, tmp_path):
-    late = ["refine.reset_interval=109", "refine.reset_from=109", "refine.reset_until=110"]
-    small = ["prompt=a red cube", "steps=110", "densifier=cadam_global_reset", "camera.size=24"]
-    small += ["initializer.count=300", "exporter=[]", "callback=[]", "device=cpu"]
-    small += ["metric.fidelity.views=4", "metric.fidelity.size=32"]
-    psnr = {}
-    for name, words in {"usual": [], "forced": ["refine.recovery=1"]}.items():
-        result = type_line("train", *small, *late, *words, f"hydra.run.dir={tmp_path / name}")
-        assert ("1 reset (step 109) is skipped" in result.err) == (name == "usual")
-        summary = read_json(tmp_path / name / "summary.json")
-        assert f"Schedule: {summary['schedule']}\n" in result.err
-        assert summary["schedule"] in (tmp_path / name / "train.log").read_text(encoding="utf-8")
-        psnr[name] = summary["psnr"]
-    assert psnr["usual"] > psnr["forced"] + 1

@@ -130,37 +130,12 @@ def test_a_run_that_ends_early_prints_its_last_step(at_noon, run, lines, capsys,
     ]
 
 
-@pytest.mark.parametrize("end", ["on_end", "on_abort"])
-def test_a_run_without_steps_prints_no_line(run, lines, capsys, end):
-    lines.on_start(*run)
-    getattr(lines, end)(*{"on_end": (*run, Outcome.FINISHED), "on_abort": run[:1]}[end])
-    assert capsys.readouterr().err == ""
-
-
-def test_disabled_progress_prints_nothing(run, lines, capsys, monkeypatch):
-    """Users and cluster scripts use the environment variable of tqdm, which reads it on import."""
-    monkeypatch.setenv("TQDM_DISABLE", "1")
-    lines.on_start(*run)
-    step(lines, run, 1)
-    lines.on_abort(run[0])
-    assert capsys.readouterr().err == ""
-
-
 def test_the_bar_shows_the_peak_of_the_gpu(bar, at_noon, run, capsys, monkeypatch):
     monkeypatch.setattr(progress, "peak_memory", lambda device: int(7.26 * 2**30))
     bar.on_start(*run)
     at_noon.now += 1
     step(bar, run, 1)
     assert "VRAM=7.3GiB" in last_line(capsys)
-
-
-def test_peak_memory_is_known_on_cuda_devices_only(monkeypatch):
-    devices = []
-    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: devices.append(device) or 123)
-    assert peak_memory(torch.device("cuda:1")) == 123
-    assert devices == [torch.device("cuda:1")]
-    assert peak_memory(CPU) is None
-    assert len(devices) == 1
 
 
 @pytest.mark.gpu

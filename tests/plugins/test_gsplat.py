@@ -6,7 +6,6 @@ trainers here call a strategy in the order of gsplat's ``examples/simple_trainer
 
 import inspect
 import io
-import pickle
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -371,24 +370,6 @@ def test_sparse_gradients_are_observed_like_dense_ones():
     assert_observed(toy.state, gradients)
 
 
-class Masked(torch.optim.Adam):
-    """An optimizer that calls the step of its parent, whose hooks torch then runs a second time."""
-
-    def step(self, closure=None):
-        return super().step(closure)
-
-
-def test_an_optimizer_that_calls_the_step_of_its_parent_is_observed_once():
-    gradients = noise(3, 10)
-    toy = Toy(CAdamStrategy(), kind=Masked)
-    fired = []
-    toy.optimizers["means"].register_step_pre_hook(lambda *args: fired.append(args))
-    for step, gradient in enumerate(gradients):
-        toy.step(step, gradient)
-    assert len(fired) == 6, "torch no longer runs the hooks twice, so this test proves nothing"
-    assert_observed(toy.state, gradients)
-
-
 def test_a_step_of_the_optimizer_that_fails_does_not_end_the_observation(monkeypatch):
     gradients = noise(3, 10)
     toy = Toy(CAdamStrategy())
@@ -404,13 +385,6 @@ def test_a_step_of_the_optimizer_that_fails_does_not_end_the_observation(monkeyp
 
 
 # Rows and states.
-
-
-def test_the_strategy_holds_only_settings_so_that_gsplats_trainer_can_write_them():
-    toy = Toy(CAdamStrategy())
-    toy.step(0, noise(1, 10)[0])
-    assert pickle.loads(pickle.dumps(toy.strategy)) == toy.strategy == CAdamStrategy()
-    assert vars(toy.strategy).keys() == vars(CAdamStrategy()).keys()
 
 
 def run(toy: Toy, first: int, last: int) -> None:
@@ -466,16 +440,6 @@ def test_refinements_follow_gsplats_schedule():
     assert counts(growing(refine_start_iter=4)) == [10, 10, 10, 10, 10, 15, 22, 33]
     assert counts(growing(refine_stop_iter=3)) == [10, 15, 22, 22, 22, 22, 22, 22]
     assert counts(growing(reset_every=4, pause_refine_after_reset=2)) == [10, 10, 15, 22, 22, 22, 33, 49]
-
-
-def test_large_gaussians_are_split_and_their_children_are_newborns():
-    torch.manual_seed(0)
-    toy = Toy(growing(grow_scale3d=0.0))
-    toy.step(1, noise(1, 10)[0])
-    assert len(toy.params["means"]) == 15
-    assert sorted(toy.state["age"].tolist()) == [0] * 10 + [1] * 5
-    assert not toy.state["m"][toy.state["age"] == 0].any()
-    assert toy.state["m"][toy.state["age"] == 1].all()
 
 
 def test_faint_gaussians_are_pruned_at_refinements_and_large_ones_after_the_first_reset():

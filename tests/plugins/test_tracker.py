@@ -58,14 +58,6 @@ def test_moments_are_those_of_the_densifier_to_the_bit():
     assert not selected.all()
 
 
-def test_a_setting_that_changes_during_training_has_an_effect():
-    tracker = tracker_of(noise(10, 100))
-    tracker.tau_Q = 0.5
-    assert int(tracker.select().sum()) == 50
-    tracker.tau_Q = 0.8
-    assert int(tracker.select().sum()) == 20
-
-
 def test_survivors_keep_their_history_and_newborns_start_at_zero_with_age_zero():
     tracker = tracker_of(noise(9, 5))
     # Clone the rows 1 and 4, then remove 0 and 4, as the densifier does it in one edit.
@@ -100,10 +92,6 @@ def test_the_format_of_the_gradient_does_not_matter(convert):
         other.observe(convert(gradient))
     assert torch.equal(tracker.state.m, other.state.m)
     assert torch.equal(tracker.state.v, other.state.v)
-
-
-def test_the_moments_move_to_another_device():
-    assert {rows.device.type for rows in tracker_of(noise(1, N)).to("meta").state_dict().values()} == {"meta"}
 
 
 def test_a_tracker_from_a_checkpoint_continues_to_the_bit():
@@ -142,22 +130,6 @@ def test_a_mistake_changes_nothing_and_names_the_remedy(mistake):
     with pytest.raises(UserError, match=message):
         call(tracker)
     assert tracker.state is before
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"tau_Q": 2}, r"^tau_Q: expected a number >= 0 and < 1, got 2\."),
-        ({"tau_SNR": -1.0}, r"^tau_SNR: "),
-        ({"min_age": -1}, r"^min_age: "),
-        ({"reset_min_age": -1}, r"^reset_min_age: "),
-        ({"reset": "some"}, r"^reset: expected one of all\|none\|unreliable, got 'some'\."),
-        ({"tau_SNR": None}, r"^reset: expected one of all\|none, got 'unreliable'\."),
-    ],
-)
-def test_a_wrong_setting_is_named_as_in_python(settings, message):
-    with pytest.raises(UserError, match=message):
-        CAdamTracker(torch.zeros(1, 3), **settings)
 
 
 @pytest.mark.parametrize("shape", [(4,), (4, 1)])
