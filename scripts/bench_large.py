@@ -5,11 +5,11 @@
     python scripts/bench_large.py --memory --counts 1000000 --views 1 2
 
 A pass is a render and its backward pass through Python and autograd, with prepared gradients of colour, alpha
-and depth. Checkouts and numbers of threads take turns, so that other load on the machine slows all of them
-alike. Times are medians of the wall clock in milliseconds.
+and depth. Every scene is rendered in processes of its own. The processes of both checkouts and all numbers of
+threads take turns, so that other load on the machine slows all alike. Times are medians of the wall clock in
+milliseconds.
 
-With --memory, every scene is rendered in a process of its own, and the table shows the growth of its peak of
-resident memory.
+With --memory, the table shows how far a pass raises the peak of resident memory of its process.
 """
 
 import argparse
@@ -28,8 +28,8 @@ from typing import Any
 import measuring
 
 SCRIPTS = Path(__file__).resolve().parent
-# Passes that are not counted: the first ones get memory from the system.
-WARM_UP = 2
+# Passes of a process. The first ones are not counted, because they get memory from the system.
+PASSES, WARM_UP = 3, 2
 
 
 @dataclass(frozen=True)
@@ -42,49 +42,28 @@ class Case:
     degree: int  # of spherical harmonics
 
 
-class Worker:
-    """A process with the sources of one checkout, which answers one question at a time."""
-
-    def __init__(self, tree: Path) -> None:
-        # As the command line sets it: threads of torch that spin would take the processor from the others.
-        environment = {
-            "OMP_WAIT_POLICY": "PASSIVE",
-            "GOMP_SPINCOUNT": "3000",
-            **os.environ,
-            "PYTHONPATH": f"{tree}{os.pathsep}{SCRIPTS}",
-        }
-        self.process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).resolve()), "--worker"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=environment,
-        )
-
-    def ask(self, **question: object) -> dict[str, Any]:
-        """Return the answer to a question; see :func:`serve`."""
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        print(json.dumps(question), file=self.process.stdin, flush=True)
-        line = self.process.stdout.readline()
-        if not line:
-            raise SystemExit(f"{question}: the process ended with exit code {self.process.wait()}")
-        return json.loads(line)
-
-    def close(self) -> None:
-        """End the process."""
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        self.process.wait()
+def start(tree: Path, case: Case, threads: int, do: str) -> dict[str, Any]:
+    """Return what :func:`measure_pass` or :func:`measure_peak` returns in a process with a checkout."""
+    # As the command line sets it: threads of torch that spin would take the processor from the others.
+    waiting = {"OMP_WAIT_POLICY": "PASSIVE", "GOMP_SPINCOUNT": "3000"}
+    environment = waiting | os.environ | {"PYTHONPATH": f"{tree}{os.pathsep}{SCRIPTS}"}
+    command = [sys.executable, str(Path(__file__).resolve()), "--worker", do]
+    command += [f"--counts={case.count}", f"--sizes={case.size}", f"--views={case.views}"]
+    command += [f"--degree={case.degree}", f"--threads={threads}"]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=environment, check=False)
+    if done.returncode:
+        raise SystemExit(f"{case}: the process ended with exit code {done.returncode}")
+    return json.loads(done.stdout)
 
 
 def main(words: Sequence[str] | None = None) -> None:
     """Print the tables, and write all numbers."""
     args = read_arguments(words)
-    if args.worker:
-        serve()
-        return
     cases = [Case(n, size, v, args.degree) for n in args.counts for size in args.sizes for v in args.views]
+    if args.worker:
+        work = {"pass": measure_pass, "peak": measure_peak}[args.worker]
+        print(json.dumps(work(cases[0], args.threads[0])))
+        return
     trees = measuring.find_trees(args.base)
     measure = measure_memory if args.memory else measure_times
     measuring.write(args.json, {"machine": measuring.machine(), **measure(cases, trees, args)})
@@ -99,27 +78,24 @@ def read_arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--views", **several, default=[1])
     parser.add_argument("--degree", type=int, default=0, choices=range(4), help="of spherical harmonics")
     parser.add_argument("--threads", **several, default=[1, 2])
-    parser.add_argument("--repeats", type=measuring.positive, default=7, help="passes that are counted")
+    parser.add_argument("--repeats", type=measuring.positive, default=3, help="processes of each kind")
     measuring.add_base(parser)
     parser.add_argument("--memory", action="store_true", help="measure memory instead of time")
     parser.add_argument("--json", type=measuring.new_file, help="also write the numbers to this file")
-    parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--worker", choices=("pass", "peak"), help=argparse.SUPPRESS)
     return parser.parse_args(words)
 
 
 def measure_times(cases: Sequence[Case], trees: dict[str, Path], args: argparse.Namespace) -> dict[str, Any]:
     """Measure, print and return the times of all scenes, and of the stages in this checkout."""
-    workers = {name: Worker(tree) for name, tree in trees.items()}
     found, rows = [], []
     for case in cases:
-        for worker in workers.values():
-            worker.ask(do="scene", **asdict(case))
         works = {
-            f"{name}, {threads} threads": partial(worker.ask, do="pass", threads=threads)
+            f"{name}, {threads} threads": partial(start, tree, case, threads, "pass")
             for threads in args.threads
-            for name, worker in workers.items()
+            for name, tree in trees.items()
         }
-        turns = measuring.in_turns(works, args.repeats, warm_up=WARM_UP)
+        turns = measuring.in_turns(works, args.repeats)
         times = {name: measuring.median(answers) for name, answers in turns.items()}
         found.append(asdict(case) | {"ms": times})
         row = {
@@ -130,8 +106,6 @@ def measure_times(cases: Sequence[Case], trees: dict[str, Path], args: argparse.
             base, here = (times[f"{name}, {threads} threads"]["both"] for name in ("base", "here"))
             row[f"base / here, {threads} threads"] = f"{base / here:.2f}"
         rows.append(row)
-    for worker in workers.values():
-        worker.close()
     print(measuring.table(rows))
     for case, each in zip(cases, found, strict=True):
         print(f"\n{case.count:,} Gaussians, {case.size} px, {case.views} views, SH degree {case.degree}\n")
@@ -154,12 +128,9 @@ def measure_memory(cases: Sequence[Case], trees: dict[str, Path], args: argparse
     """Measure, print and return the peak of memory of one pass of each scene."""
     found, rows = [], []
     for case in cases:
-        peaks = {}
-        for name, tree in trees.items():
-            worker = Worker(tree)
-            worker.ask(do="scene", **asdict(case))
-            peaks[name] = worker.ask(do="peak", threads=args.threads[-1])["peak_bytes"]
-            worker.close()
+        peaks = {
+            name: start(tree, case, args.threads[-1], "peak")["peak_bytes"] for name, tree in trees.items()
+        }
         found.append(asdict(case) | {"peak_bytes": peaks})
         cells = {f"{name}: peak, MB": f"{peak / 1e6:.0f}" for name, peak in peaks.items()}
         rows.append({**asdict(case), **cells, "bytes per Gaussian": f"{peaks['here'] / case.count:.0f}"})
@@ -170,42 +141,39 @@ def measure_memory(cases: Sequence[Case], trees: dict[str, Path], args: argparse
 # --- the process that renders -----------------------------------------------------------------------------
 
 
-def serve() -> None:
-    """Answer questions from the standard input, one a line, until it ends.
-
-    ``scene`` makes a scene, ``pass`` times a render and its backward pass, and ``peak`` measures the memory
-    of one pass.
-    """
+def make_scene_of(case: Case, threads: int) -> tuple[Any, Any]:
+    """Return the rasterizer and a scene."""
     import torch
     from rasterizer_bench.scenes import make_scene, make_shell
 
+    from cadam3d.rasterizer.cpu import CpuRasterizer
+
+    torch.set_num_threads(threads)
+    rasterizer = CpuRasterizer(cache_dir=None)
+    rasterizer.prepare(torch.device("cpu"))
+    return rasterizer, make_scene(
+        make_shell(case.count, case.degree, torch.device("cpu")), case.size, case.views
+    )
+
+
+def measure_pass(case: Case, threads: int) -> dict[str, Any]:
+    """Return the median times of a pass."""
+    rasterizer, scene = make_scene_of(case, threads)
+    return measuring.median([time_pass(rasterizer, scene) for _ in range(WARM_UP + PASSES)][WARM_UP:])
+
+
+def measure_peak(case: Case, threads: int) -> dict[str, Any]:
+    """Return how many bytes one pass adds to the peak of the resident memory."""
+    rasterizer, scene = make_scene_of(case, threads)
+    before = resident_bytes(reset=True)
+    time_pass(rasterizer, scene)
+    return {"peak_bytes": resident_bytes() - before}
+
+
+def time_pass(rasterizer: Any, scene: Any) -> dict[str, Any]:
+    """Return the milliseconds of a render, of its backward pass, and of the stages of the kernels."""
     from cadam3d.rasterizer import cpu
 
-    rasterizer = cpu.CpuRasterizer(cache_dir=None)
-    scene = None
-    for line in sys.stdin:
-        question = json.loads(line)
-        torch.set_num_threads(question.pop("threads", 1))
-        match question.pop("do"):
-            case "scene":
-                case = Case(**question)
-                gaussians = make_shell(case.count, case.degree, torch.device("cpu"))
-                scene = make_scene(gaussians, case.size, case.views)
-                answer = {}
-            case "pass":
-                answer = time_pass(rasterizer, scene, cpu)
-            case "peak":
-                rasterizer.prepare(torch.device("cpu"))
-                before = resident_bytes(reset=True)
-                time_pass(rasterizer, scene, cpu)
-                answer = {"peak_bytes": resident_bytes() - before}
-            case other:
-                raise ValueError(other)
-        print(json.dumps(answer), flush=True)
-
-
-def time_pass(rasterizer: Any, scene: Any, cpu: Any) -> dict[str, Any]:
-    """Return the milliseconds of a render, of its backward pass, and of the stages of the kernels."""
     scene.zero_grad()
     start = time.perf_counter()
     output = rasterizer.render(scene.gaussians, scene.cameras, scene.background)

@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import measuring
 from rasterizer_bench.check import check, check_long_sort
 from rasterizer_bench.scenes import make_scene, make_shell
-from rasterizer_bench.stages import copy_speed, time_stages
+from rasterizer_bench.stages import time_stages
 from rasterizer_bench.timing import OUT_OF_MEMORY, take_turns
 
 from cadam3d.build import component
@@ -53,8 +53,6 @@ DEFAULTS = {
 }
 # A yardstick that is optional: it is skipped where it cannot run.
 GSPLAT = "gsplat"
-# The size of the copy that determines the floor of each stage.
-COPY_BYTES = {"cuda": 2**31, "cpu": 2**25}
 # Keys; more than a counter of 27 bits can count.
 LONG_SORT = 2**27 + 1
 
@@ -129,8 +127,6 @@ def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher
     device = torch.device(args.device)
     report: dict[str, Any] = {"machine": measuring.machine(device), "rows": [], "stages": []}
     report["settings"] = {name: value for name, value in vars(args).items() if name != "json"}
-    speed = copy_speed(device, COPY_BYTES[device.type]) if launcher is not None and args.stages else None
-    report["copy_bytes_per_ms"] = speed
     print(f"{report['machine']['name']}, {args.threads} thread(s), {args.repeats} repetitions; milliseconds")
     for degree, count in product(args.degrees, args.counts):
         gaussians = make_shell(count, degree, device)
@@ -140,8 +136,8 @@ def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher
             timings = take_turns(backends, scene, args.repeats)
             report["rows"] += make_rows(at, timings)
             print_table(make_rows(at, timings))
-            if launcher is not None and speed is not None and timings["cuda"]:
-                timing = time_stages(launcher, scene, args.repeats, speed)
+            if launcher is not None and args.stages and timings["cuda"]:
+                timing = time_stages(launcher, scene, args.repeats)
                 print_table(timing.stages)
                 report["stages"].append(at | vars(timing))
             # The file is written after every scene, because a later one may exceed the memory.

@@ -5,6 +5,7 @@
 
 The resulting objects are meaningless, but a step costs as much as with real weights. Random weights are saved
 like a real model, so that loading is timed too (Stable Diffusion 2.1: 1.9 GB, 3.5-medium: 4.7 GB in 16 bit).
+``scripts/bench_step.py --priors random`` splits a step into its parts.
 """
 
 import argparse
@@ -12,7 +13,6 @@ import json
 import sys
 import tempfile
 import time
-from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -117,25 +117,6 @@ def save(
     (folder / "model_index.json").write_text(json.dumps(index))
 
 
-class Stopwatch:
-    """Measures seconds per stage. It synchronizes a GPU before and after each stage, which slows the run."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.device = device
-        self.seconds = defaultdict[str, float](float)
-        self.calls = defaultdict[str, int](int)
-
-    def __call__(self, stage: str, work: Callable[..., Any]) -> Callable[..., Any]:
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            started = measuring.now(self.device)
-            result = work(*args, **kwargs)
-            self.seconds[stage] += measuring.now(self.device) - started
-            self.calls[stage] += 1
-            return result
-
-        return timed
-
-
 def random_texts(prior: Any) -> None:
     """Replace the text encoders by random embeddings; they run once per prompt and are not part of a step."""
     from cadam3d.prior.latent import blank_texts
@@ -155,7 +136,7 @@ def random_texts(prior: Any) -> None:
 
 
 def measure(recipe: str, model: Path, args: argparse.Namespace) -> dict[str, Any]:
-    """Train for some steps, and return the seconds per step and per stage, and the peak memory in bytes."""
+    """Train for some steps, and return the seconds per step and the peak memory in bytes."""
     device = resolve_device(args.device)
     lines = [f"experiment={recipe}", "prompt=a corgi", f"prior.path={model}", "initializer=ball"]
     lines += [f"initializer.count={args.count}", f"steps={args.steps}", f"prior.cache_dir={model / 'texts'}"]
@@ -169,10 +150,6 @@ def measure(recipe: str, model: Path, args: argparse.Namespace) -> dict[str, Any
     embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)
     trainer.prior.load()
     loading = time.perf_counter() - started
-    watch = Stopwatch(device)
-    for name in ("encode", "decode", "predict"):
-        object.__setattr__(trainer.prior, name, watch(name, getattr(trainer.prior, name)))
-    object.__setattr__(trainer.rasterizer, "render_ahead", watch("render", trainer.rasterizer.render_ahead))
     state = trainer.start(cfg.prompt, component(cfg.initializer), 0, device)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
@@ -180,23 +157,16 @@ def measure(recipe: str, model: Path, args: argparse.Namespace) -> dict[str, Any
         context = run_context(cfg.prompt, trainer, state, Path(folder))
         warm: Trainer = replace(trainer, steps=args.warmup)
         warm.train(state, embedding, context)
-        watch.seconds.clear()
-        watch.calls.clear()
         before = measuring.now(device)
         trainer.train(state, embedding, context)
         total = measuring.now(device) - before
-    steps = args.steps - args.warmup
-    stages = {name: seconds / steps for name, seconds in watch.seconds.items()}
-    stages["everything else, backward included"] = total / steps - sum(stages.values())
     peak = torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None
     return {
         "recipe": recipe,
         "vram": args.vram,
         "backend": backend.name,
         "loading_seconds": loading,
-        "seconds_per_step": total / steps,
-        "stages": stages,
-        "predictions_per_step": watch.calls["predict"] / steps,
+        "seconds_per_step": total / (args.steps - args.warmup),
         "num_gaussians": len(state.gaussians),
         "estimate_bytes": estimate.total,
         "peak_bytes": peak,

@@ -7,11 +7,11 @@ interval of a bootstrap over prompts and the p-value of a sign test over prompts
 (docs/sweeps.md). PSNR is that at the best turn.
 """
 
-import argparse
 from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
 
+import measuring
 import numpy as np
 
 from cadam3d.io.records import read_metrics
@@ -45,7 +45,7 @@ STATISTICS = ("snr_p10", "snr_p50", "snr_p90", "share_above_tau_SNR")
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table in Markdown."""
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (columns, ["---"] * len(columns), *rows))
+    return "\n".join([measuring.header(columns), *map(measuring.line_of, rows)])
 
 
 def part(results: Sequence[JobResult], prior: str, scale: str) -> list[JobResult]:
@@ -160,9 +160,7 @@ def over_time(results: Sequence[JobResult], arm: str) -> str:
 
 
 def main(line: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = measuring.parser_of(__doc__)
     parser.add_argument("sweep", type=Path, help="folder of the sweep")
     results = read(parser.parse_args(line).sweep)
     for name, own in parts(results):

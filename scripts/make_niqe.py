@@ -1,7 +1,6 @@
-"""Make cadam3d/metric/niqe_parameters.npz, and compare our NIQE with that of basicsr.
+"""Fit the parameters of metric=niqe and write cadam3d/metric/niqe_parameters.npz.
 
-    python scripts/make_niqe.py                       # fits the parameters of metric=niqe
-    python scripts/make_niqe.py --basicsr DIR         # writes tests/metric/niqe_basicsr.json
+    python scripts/make_niqe.py
 
 The parameters are fitted to photographs that are installed with scikit-image and matplotlib: Eileen Collins
 (NASA), the cameraman (Lav Varshney), the cat Chelsea (Stefan van der Walt), a cup of coffee (Rachel
@@ -10,25 +9,13 @@ Michetti), a motorcycle (the Middlebury 2014 stereo benchmark), Greek coins (Bro
 different: every photograph except the last also counts at half its size, blocks overlap by half, and blocks
 count from 0.4 of the sharpness of the sharpest one instead of 0.75. Chosen in this way, the numbers have the
 magnitude of those with the published parameters, but they are not the same.
-
-DIR is an unpacked source distribution of basicsr 1.4.2. Its niqe.py runs as it is, apart from modules that
-it imports and does not need here.
 """
 
-import argparse
-import importlib.util
-import json
-import sys
-import types
-import warnings
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import imageio.v3 as iio
 import matplotlib
 import numpy as np
-import scipy.ndimage
 import skimage
 from jaxtyping import Float, Float32
 
@@ -43,26 +30,15 @@ WINDOW = 7  # pixels
 WINDOW_SIGMA = 7 / 6  # pixels
 OFFSETS = (0, natural.BLOCK // 2)  # of the blocks, in both directions
 SHARPNESS = 0.4  # relative to the sharpest block of a photograph
-TESTS = Path(__file__).parent.parent / "tests"
-EXPECTED = TESTS / "metric/niqe_basicsr.json"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--basicsr", metavar="DIR", type=Path)
-    folder = parser.parse_args().basicsr
-    if folder is None:
-        pristine = fitted(photographs())
-        with replacing(OWN_PARAMETERS) as temporary:
-            values = (pristine.mean[None], pristine.covariance, pristine.window)
-            np.savez(temporary, **dict(zip(natural.KEYS, values, strict=True)))
-        print(OWN_PARAMETERS)
-        return
-    with replacing(EXPECTED) as temporary:
-        temporary.write_text(json.dumps(expected(folder / "basicsr"), indent=1) + "\n", encoding="utf-8")
-    print(EXPECTED)
+    """Fit and write the parameters."""
+    pristine = fitted(photographs())
+    with replacing(OWN_PARAMETERS) as temporary:
+        values = (pristine.mean[None], pristine.covariance, pristine.window)
+        np.savez(temporary, **dict(zip(natural.KEYS, values, strict=True)))
+    print(OWN_PARAMETERS)
 
 
 def photographs() -> list[Float32[np.ndarray, "h w"]]:
@@ -102,62 +78,6 @@ def _sharp_blocks(
     sharpness = blocks.mean(axis=(1, 2))
     is_whole = ~np.isnan(features).any(axis=1)
     return features[(sharpness > SHARPNESS * sharpness[is_whole].max()) & is_whole]
-
-
-def expected(package: Path) -> dict[str, Any]:
-    """Return basicsr's numbers for the images of the tests, with its parameters and with ours."""
-    calculate, niqe = _basicsr(package)
-    with OWN_PARAMETERS.open("rb") as file, np.load(file) as stored:
-        ours = [stored[key] for key in natural.KEYS]
-    numbers: dict[str, Any] = {"own": {}, "basicsr": {}}
-    for name, image in _imported("niqe_images", TESTS / "niqe_images.py").images().items():
-        bgr = image[..., ::-1]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # plain blocks have no fit
-            numbers["basicsr"][name] = calculate(bgr, crop_border=0, input_order="HWC", convert_to="y")
-            luma = sys.modules["basicsr.metrics.metric_util"].to_y_channel(bgr.astype(np.float32))
-            numbers["own"][name] = niqe(luma.squeeze().round(), *ours)
-    return numbers
-
-
-def _basicsr(package: Path) -> tuple[Callable[..., float], Callable[..., float]]:
-    """Return ``calculate_niqe`` and ``niqe`` of basicsr."""
-
-    class Registry:
-        def register(self) -> Callable[[Any], Any]:
-            return lambda function: function
-
-    def module(name: str, **entries: Any) -> Any:
-        made = types.ModuleType(name)
-        vars(made).update(entries)
-        sys.modules[name] = made
-        return made
-
-    def read(name: str) -> Any:
-        return _imported(name, package.parent / Path(*name.split(".")).with_suffix(".py"))
-
-    module("cv2")
-    module("scipy.ndimage.filters", convolve=scipy.ndimage.convolve)  # its old name
-    module("basicsr")
-    module("basicsr.metrics")
-    module("basicsr.utils.registry", METRIC_REGISTRY=Registry())
-    utils = module("basicsr.utils")
-    utils.bgr2ycbcr = read("basicsr.utils.color_util").bgr2ycbcr
-    read("basicsr.utils.matlab_functions")
-    read("basicsr.metrics.metric_util")
-    found = read("basicsr.metrics.niqe")
-    return found.calculate_niqe, found.niqe
-
-
-def _imported(name: str, path: Path) -> Any:
-    """Return the module in a file."""
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    made = importlib.util.module_from_spec(spec)
-    sys.modules[name] = made
-    spec.loader.exec_module(made)
-    return made
 
 
 if __name__ == "__main__":

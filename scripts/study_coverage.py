@@ -8,12 +8,12 @@ normal. The true rate is the one over all raters and all prompts. ``docs/notes/s
 result.
 """
 
-import argparse
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 
 import numpy as np
+from measuring import header, line_of, parser_of, positive
 from scipy.optimize import brentq
 from scipy.special import expit
 
@@ -201,10 +201,8 @@ def alarm_rows(simulations: int) -> Iterator[Sequence[str]]:
 
 def main() -> None:
     """Print the three tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--simulations", type=int, default=2000, help="for each line of a table")
+    parser = parser_of(__doc__)
+    parser.add_argument("--simulations", type=positive, default=2000, help="for each line of a table")
     simulations = parser.parse_args().simulations
     titles = {
         "Rates: coverage in % (mean width in %)": rate_rows,
@@ -213,10 +211,8 @@ def main() -> None:
     }
     for title, rows in titles.items():
         print(f"\n{title}\n")
-        for i, cells in enumerate(rows(simulations)):
-            print(f"| {' | '.join(cells)} |", flush=True)
-            if i == 0:
-                print(f"|{'---|' * len(cells)}", flush=True)
+        columns, *cells = rows(simulations)
+        print("\n".join([header(columns), *map(line_of, cells)]), flush=True)
 
 
 if __name__ == "__main__":

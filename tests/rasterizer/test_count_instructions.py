@@ -1,12 +1,7 @@
 """The script that counts the instructions of the CUDA kernels."""
 
-import json
 import sys
 from pathlib import Path
-
-import pytest
-
-from cadam3d.rasterizer.nvrtc import find_compiler
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))  # as Python does for a script
 
@@ -50,18 +45,3 @@ def test_a_loop_is_divided_into_slot_sums_and_pixels():
     assert kernel.instructions == 14, "without the padding"
     slots = kernel.slots
     assert (slots.slot, slots.sums, slots.pixel, slots.all) == (4, 4, 1.5, 11)
-
-
-@pytest.mark.slow
-def test_the_kernels_are_counted(tmp_path):
-    if find_compiler() is None or count_instructions.find_nvdisasm() is None:
-        pytest.skip("no NVRTC or no nvdisasm")
-    count_instructions.main(["--json", str(tmp_path / "counts.json")])
-    kernels = json.loads((tmp_path / "counts.json").read_text())["here"]
-    small, large = kernels["blend_backward_8x4"], kernels["blend_backward_8x8"]
-    for kernel in (small, large):
-        slots = kernel["slots"]
-        assert 0 < slots["slot"] < slots["all"] < kernel["instructions"]
-        assert slots["sums"] > 12, "twelve shuffles"
-    assert large["slots"]["all"] > small["slots"]["all"] + small["slots"]["pixel"] / 2
-    assert kernels["tile_ranges"]["slots"] is None
