@@ -1,7 +1,11 @@
-"""A small protocol for the tests of metrics that score pictures."""
+"""A small protocol and rendered pictures for the tests of metrics."""
 
 from typing import Any
 
+import torch
+from torch import Tensor
+
+from cadam3d.core.rendering import RenderOutput
 from cadam3d.metric.protocol import RingProtocol
 
 
@@ -21,3 +25,9 @@ def ring(**changes: Any) -> RingProtocol:
         "models": {},
     }
     return RingProtocol(**settings | changes)
+
+
+def output(rgb: Tensor, alpha: Tensor | None = None) -> RenderOutput:
+    """Return what a renderer returns for these pictures "v h w 3", of no Gaussians."""
+    alpha = rgb[..., 0] if alpha is None else alpha
+    return RenderOutput(rgb, alpha, alpha, torch.zeros(len(rgb), 0, 2), torch.zeros(len(rgb), 0))

@@ -140,20 +140,6 @@ def test_the_numbers_of_the_clips_cannot_be_computed_from_the_page_and_the_seed(
     assert keys[0] != keys[1]
 
 
-def test_all_clips_have_the_same_size_and_length(arms, type_line, tmp_path):
-    import base64
-    import io
-
-    from PIL import Image
-
-    type_line("study", arms, *SMALL)
-    page = (tmp_path / "study/study.html").read_text(encoding="utf-8")
-    clips = re.findall(r'<script type="text/plain" id="clip-\d+">(.*?)</script>', page, re.DOTALL)
-    frames = [[Image.open(io.BytesIO(base64.b64decode(line))) for line in clip.split("\n")] for clip in clips]
-    assert {len(clip) for clip in frames} == {2}
-    assert {(frame.format, *frame.size) for clip in frames for frame in clip} == {("WEBP", 16, 16)}
-
-
 def test_answers_become_a_table_and_files_beside_the_key(arms, type_line, tmp_path):
     type_line("study", arms, *SMALL)
     key = read_json(tmp_path / "study/key.json")
@@ -214,11 +200,6 @@ def test_a_folder_with_a_key_is_not_written_again(arms, type_line, tmp_path):
     assert message.startswith("output: expected a folder of its own, got one with key.json")
     assert message.endswith("Try: output=study-2")
     assert (tmp_path / "study/key.json").read_bytes() == before
-
-
-def test_a_study_is_not_written_into_the_folder_of_a_run(arms, type_line):
-    message = type_line("study", arms, *SMALL, "output=heron/0").message
-    assert message.startswith("output: expected a folder of its own, got one with asset.ply")
 
 
 def test_objects_that_cannot_be_seen_make_no_catch_trial(tmp_path, type_line):

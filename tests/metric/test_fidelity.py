@@ -2,10 +2,11 @@
 
 import pytest
 import torch
+from protocols import output
+from splats import make_gaussians
 
 from cadam3d.core.cameras import turntable
-from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.rendering import RenderOutput, Truth
+from cadam3d.core.rendering import Truth
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.fidelity import Fidelity
 
@@ -17,12 +18,6 @@ SETTINGS = {
     "size": 16,
     "background": [1.0, 1.0, 1.0],
 }
-
-
-def no_gaussians() -> Gaussians:
-    return Gaussians(
-        torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, 1, 3)
-    )
 
 
 def scene(cameras, background):
@@ -38,9 +33,7 @@ def scene(cameras, background):
 
 def renders(shift):
     def render(cameras, background):
-        rgb = scene(cameras, background) + shift
-        empty = torch.zeros(len(cameras), 0)
-        return RenderOutput(rgb, rgb[..., 0], rgb[..., 0], empty[..., None].expand(-1, 0, 2), empty)
+        return output(scene(cameras, background) + shift)
 
     return render
 
@@ -55,7 +48,7 @@ def truths(*shifts):
 def measure(render, truth, **changes):
     measurement = Fidelity(**{**SETTINGS, **changes}).measure(
         Measurand(
-            gaussians=no_gaussians(),
+            gaussians=make_gaussians(0),
             render=render,
             prompt="a cube",
             truth=None if truth is None else Truth(truth),
@@ -102,9 +95,7 @@ def test_ssim_of_flat_images_is_its_luminance_term():
         return lambda cameras, _: torch.full((1, len(cameras), cameras.height, cameras.width, 3), level)
 
     def render(cameras, background):
-        rgb = flat(0.4)(cameras, background)[0]
-        empty = torch.zeros(len(cameras), 0)
-        return RenderOutput(rgb, rgb[..., 0], rgb[..., 0], empty[..., None].expand(-1, 0, 2), empty)
+        return output(flat(0.4)(cameras, background)[0])
 
     c1 = 0.01**2
     expected = (2 * 0.4 * 0.6 + c1) / (0.4**2 + 0.6**2 + c1)

@@ -7,12 +7,11 @@ import shutil
 import pytest
 import torch
 from PIL import Image
-from protocols import ring
+from protocols import output, ring
 from safetensors.torch import save_file
 from splats import make_gaussians
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.rendering import RenderOutput
 from cadam3d.metric import hps, transformer
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.hps import Hps
@@ -22,10 +21,7 @@ PICTURES = torch.rand(3, 32, 32, 3, generator=torch.Generator().manual_seed(0))
 
 
 def render(cameras, background):
-    empty = torch.zeros(len(cameras), 0)
-    return RenderOutput(
-        PICTURES, PICTURES[..., 0], PICTURES[..., 0], empty[..., None].expand(-1, 0, 2), empty
-    )
+    return output(PICTURES)
 
 
 MEASURAND = Measurand(gaussians=make_gaussians(2), render=render, prompt="a red cube")

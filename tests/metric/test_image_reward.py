@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from protocols import ring
+from protocols import output, ring
 from splats import make_gaussians
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.rendering import RenderOutput
 from cadam3d.metric import image_reward
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.image_reward import ImageReward
@@ -28,8 +27,7 @@ PICTURES = torch.rand(3, 8, 8, 3, generator=torch.Generator().manual_seed(0))
 
 
 def render(cameras, background):
-    alpha, empty = PICTURES[..., 0], torch.zeros(len(cameras), 0)
-    return RenderOutput(PICTURES, alpha, alpha, empty[..., None].expand(-1, 0, 2), empty)
+    return output(PICTURES)
 
 
 def measurand(prompt="red cube"):

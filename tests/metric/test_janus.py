@@ -6,12 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 from composed import composed
+from protocols import output
 from splats import make_gaussians
 
 from cadam3d.build import component, components
 from cadam3d.core.cameras import turntable
 from cadam3d.core.gaussians import Gaussians, concatenate
-from cadam3d.core.rendering import RenderOutput, Truth
+from cadam3d.core.rendering import Truth
 from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.janus import VIEWS, Janus
 from cadam3d.metric.scoring import Scorer
@@ -23,11 +24,6 @@ ONE = make_gaussians(1)
 
 def metric(**changes) -> Janus:
     return replace(SETTINGS["janus"], **changes)
-
-
-def shown(rgb):
-    empty = torch.zeros(len(rgb), 0)
-    return RenderOutput(rgb, rgb[..., 0], rgb[..., 0], empty[..., None].expand(-1, 0, 2), empty)
 
 
 # --- by the truth, on prior=shapes -----------------------------------------------------------------------
@@ -69,7 +65,7 @@ def measured(ring: Ring, asset, **changes):
             sum(weight * ring.row(at % 360, level) for at, weight in asset(round(float(azimuth) % 360)))
             for azimuth in cameras.azimuth_deg
         ]
-        return shown(torch.stack(rows))
+        return output(torch.stack(rows))
 
     measurand = Measurand(gaussians=ONE, render=render, prompt="a car", truth=Truth(ring), **changes)
     return metric().measure(measurand)
@@ -143,7 +139,7 @@ def test_the_best_mode_of_an_open_prompt_counts(car):
 
     measurand = Measurand(
         gaussians=ONE,
-        render=lambda cameras, background: shown(car(cameras, background)[0]),
+        render=lambda cameras, background: output(car(cameras, background)[0]),
         prompt="",
         truth=Truth(modes),
     )
@@ -196,7 +192,7 @@ class ByEye(Janus):
         return Scorer(score=score, facts={"model": "a stand-in"})
 
 
-def seen(*fronts_deg, heights=(), contrast=1.0, turn=0.0, **changes):
+def seen(*fronts_deg, heights=(), contrast=1.0, **changes):
     """Return what the stand-in says about an asset with a front at each azimuth."""
     heights = heights or (1.0,) * len(fronts_deg)
 
@@ -204,13 +200,13 @@ def seen(*fronts_deg, heights=(), contrast=1.0, turn=0.0, **changes):
         colors = []
         for azimuth in cameras.azimuth_deg.tolist():
             near = [
-                height * max(0.0, math.cos(math.radians(azimuth - turn - front)))
+                height * max(0.0, math.cos(math.radians(azimuth - front)))
                 for front, height in zip(fronts_deg, heights, strict=True)
             ]
             front = contrast * max(near)
             colors.append([front, 0.5 * (1 - front), 0.5 * (1 - front)])
         size = cameras.height
-        return shown(torch.tensor(colors)[:, None, None].expand(-1, size, size, 3))
+        return output(torch.tensor(colors)[:, None, None].expand(-1, size, size, 3))
 
     settings = {**vars(metric(by="model")), **changes}
     measurand = Measurand(gaussians=ONE, render=render, prompt="a corgi")
@@ -232,12 +228,6 @@ def test_two_fronts_are_worse_than_one_and_three_are_counted():
     assert seen(0, 120, 240).numbers == {"janus": pytest.approx(1), "janus_fronts": 3}
 
 
-@pytest.mark.parametrize("turn", [15.0, 120.0, 345.0])
-def test_a_model_counts_the_same_fronts_of_a_turned_asset(turn):
-    for fronts in ((0,), (0, 180)):
-        assert seen(*fronts, turn=turn).numbers == pytest.approx(seen(*fronts).numbers, abs=1e-5)
-
-
 def test_without_a_clear_front_there_is_no_number():
     found = seen(0, contrast=0.01)
     assert found.numbers == {}
@@ -251,7 +241,7 @@ def test_the_sides_are_the_softmax_over_three_texts_of_a_clip_model(clip_folder)
     pictures = torch.rand(6, 32, 32, 3, generator=torch.Generator().manual_seed(0))
 
     def render(cameras, background):
-        return shown(pictures[[round(float(azimuth) % 360) // 60 for azimuth in cameras.azimuth_deg]])
+        return output(pictures[[round(float(azimuth) % 360) // 60 for azimuth in cameras.azimuth_deg]])
 
     measurand = Measurand(gaussians=ONE, render=render, prompt="a corgi")
     found = metric(by="model", model=str(clip_folder), views=6).measure(measurand).details["janus"]
@@ -279,16 +269,9 @@ def test_the_truth_is_preferred_to_a_model_unless_the_line_says_otherwise(car, m
         return Measurement({})
 
     monkeypatch.setattr(Janus, "_by_model", ask)
-    known = Measurand(gaussians=ONE, render=lambda c, b: shown(car(c, b)[0]), prompt="", truth=Truth(car))
+    known = Measurand(gaussians=ONE, render=lambda c, b: output(car(c, b)[0]), prompt="", truth=Truth(car))
     unknown = replace(known, truth=None)
     for by, measurand in (("auto", unknown), ("model", known), ("auto", known)):
         metric(by=by).measure(measurand)
     assert asked == ["auto", "model"]
     assert metric(by="truth").measure(unknown).numbers == {}
-
-
-def test_an_asset_without_gaussians_has_no_front():
-    measurand = Measurand(
-        gaussians=ONE.index(slice(0, 0)), render=lambda *_: pytest.fail("rendered"), prompt=""
-    )
-    assert metric().measure(measurand).numbers == {}

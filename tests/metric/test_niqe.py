@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 import torch
 from niqe_images import images
-from protocols import ring
+from protocols import output, ring
 from splats import make_gaussians
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.rendering import RenderOutput
 from cadam3d.metric import natural
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.niqe import OWN_NAME, OWN_PARAMETERS, Niqe
@@ -39,9 +38,7 @@ def showing(*pictures):
     waiting = list(pictures)
 
     def render(cameras, background):
-        shown = torch.stack([waiting.pop(0) for _ in range(len(cameras))])
-        empty = torch.zeros(len(cameras), 0)
-        return RenderOutput(shown, shown[..., 0], shown[..., 0], empty[..., None].expand(-1, 0, 2), empty)
+        return output(torch.stack([waiting.pop(0) for _ in range(len(cameras))]))
 
     return Measurand(gaussians=make_gaussians(3), render=render, prompt="a cat")
 

@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from protocols import output
+from splats import make_gaussians
 
-from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.rendering import RenderOutput, Truth
+from cadam3d.core.rendering import Truth
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.outline import Outline
 
@@ -17,12 +18,6 @@ SETTINGS = {
     "background": [1.0, 1.0, 1.0],
 }
 RED, GREY, BLUE = (0.86, 0.12, 0.12), (0.5, 0.5, 0.5), (0.14, 0.3, 0.84)
-
-
-def no_gaussians() -> Gaussians:
-    return Gaussians(
-        torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, 1, 3)
-    )
 
 
 def disc(cameras, radius):
@@ -39,9 +34,7 @@ def painted(cameras, background, radius, colour):
 
 def renders(radius, colour=RED):
     def render(cameras, background):
-        alpha, empty = disc(cameras, radius), torch.zeros(len(cameras), 0)
-        rgb = painted(cameras, background, radius, colour)
-        return RenderOutput(rgb, alpha, alpha, empty[..., None].expand(-1, 0, 2), empty)
+        return output(painted(cameras, background, radius, colour), disc(cameras, radius))
 
     return render
 
@@ -58,7 +51,7 @@ def measure(render, truth, **changes):
 
 
 def seen_as(render, truth):
-    return Measurand(gaussians=no_gaussians(), render=render, prompt="a disc", truth=truth)
+    return Measurand(gaussians=make_gaussians(0), render=render, prompt="a disc", truth=truth)
 
 
 def test_an_asset_that_is_the_truth_has_an_overlap_of_one_and_no_colour_error():

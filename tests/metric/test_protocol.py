@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from protocols import output
 
 from cadam3d.build import option
 from cadam3d.core.errors import UserError
-from cadam3d.core.rendering import RenderOutput
 from cadam3d.metric.protocol import Protocol, RingProtocol, SphereProtocol
 
 PICTURES = {
@@ -78,8 +78,7 @@ def disc_at(row, column, radius):
         alpha = ((x - column) ** 2 + (y - row) ** 2 < radius**2).float().expand(len(cameras), 40, 40)
         red = torch.tensor([1.0, 0.0, 0.0])
         rgb = alpha[..., None] * red + (1 - alpha[..., None]) * background[:, None, None]
-        empty = torch.zeros(len(cameras), 0)
-        return RenderOutput(rgb, alpha, alpha, empty[..., None].expand(-1, 0, 2), empty)
+        return output(rgb, alpha)
 
     return render
 

@@ -6,11 +6,10 @@ import shutil
 import pytest
 import torch
 from PIL import Image
-from protocols import ring
+from protocols import output, ring
 from splats import make_gaussians
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.rendering import RenderOutput
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.vqa import Vqa
 
@@ -30,8 +29,7 @@ PICTURES = torch.rand(3, 32, 32, 3, generator=torch.Generator().manual_seed(0)).
 
 
 def render(cameras, background):
-    alpha, empty = PICTURES[..., 0], torch.zeros(len(cameras), 0)
-    return RenderOutput(PICTURES, alpha, alpha, empty[..., None].expand(-1, 0, 2), empty)
+    return output(PICTURES)
 
 
 MEASURAND = Measurand(gaussians=make_gaussians(2), render=render, prompt="red cube")
@@ -152,11 +150,3 @@ def test_a_model_without_a_chat_template_needs_a_template(folder, tmp_path, shar
     (bare / "chat_template.jinja").unlink()
     assert refusal(bare).startswith("metric.vqa.template: expected a text")
     metric(bare, template="<image>{}").measure(MEASURAND)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"), [("question", "What is it?"), ("template", "<image>"), ("dtype", "int8")]
-)
-def test_wrong_settings_are_refused(folder, key, value):
-    with pytest.raises(UserError, match=f"metric.vqa.{key}: expected"):
-        metric(folder, **{key: value})
