@@ -118,12 +118,10 @@ def facts_of(run: Path | None) -> dict[str, Any]:
     summary = read_summary(run) if run is not None else {}
     facts: dict[str, Any] = {name: _plain(summary.get(key)) for name, key in FACTS.items()}
     # A run that still trains has no summary. Its configuration names classes, not options.
-    if run is not None and None in (facts["prompt"], facts["seed"]):
+    if run is not None and not summary:
         with suppress(UserError):
             config = read_config(run / CONFIG)
-            for name in ("prompt", "seed"):
-                if facts[name] is None:
-                    facts[name] = _plain(config.get(name))
+            facts |= {name: _plain(config.get(name)) for name in ("prompt", "seed")}
     return facts | {"trained_with": {name: _plain(summary.get(name)) for name in VERSIONS}}
 
 

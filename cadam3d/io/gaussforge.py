@@ -29,7 +29,6 @@ Sources: the metadata of gaussforge 0.6.0 on pypi.org, and comparisons of its fi
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -59,15 +58,6 @@ def require_gaussforge(key: str) -> None:
         )
 
 
-def _imported(key: str) -> Any:
-    require_gaussforge(key)
-    try:
-        return import_module(PACKAGE)
-    except ImportError as error:
-        problem = f"{key}: {PACKAGE} is installed but cannot be imported ({error})"
-        raise UserError(f"{problem}. Try: pip install --force-reinstall {PACKAGE}") from error
-
-
 def write_sog(path: Path, gaussians: Gaussians, *, up: str) -> None:
     """Write ``gaussians`` as SOG version 2, atomically, in the axes with up axis ``up``.
 
@@ -89,10 +79,8 @@ def write_spz4(path: Path, gaussians: Gaussians, *, up: str) -> None:
     """
     extent = float(gaussians.means.abs().max()) if len(gaussians) else 0.0
     if extent > FARTHEST_SPZ4:
-        raise UserError(
-            f"{path}: expected positions up to {FARTHEST_SPZ4:,.0f}, which is the range of SPZ version 4, "
-            f"got {extent:g}. Try: exporter.spz.version=3"
-        )
+        problem = f"{path}: expected positions up to {FARTHEST_SPZ4:,.0f}, got {extent:g}"
+        raise UserError(f"{problem}. Try: exporter.spz.version=3")
     _write(path, gaussians, up=up, kind="spz")
 
 
@@ -115,10 +103,10 @@ def _write(path: Path, gaussians: Gaussians, *, up: str, kind: str) -> None:
         "extras": {},
         "meta": {"shDegree": round((rest.shape[1] + 1) ** 0.5) - 1, "sourceFormat": "ply"},
     }
-    result = _imported(f"exporter.{kind}").GaussForge().write(cloud, kind, spz_version=4)
+    require_gaussforge(f"exporter.{kind}")
+    result = import_module(PACKAGE).GaussForge().write(cloud, kind, spz_version=4)
     if "error" in result:
-        reason = str(result["error"])
-        raise UserError(f"{path}: gaussforge cannot write it ({reason}). Try: 'exporter=[ply]'")
+        raise UserError(f"{path}: gaussforge cannot write it ({result['error']}). Try: 'exporter=[ply]'")
     with replacing(path) as temporary:
         temporary.write_bytes(result["data"])
 

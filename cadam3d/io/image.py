@@ -4,6 +4,7 @@ import math
 import re
 import warnings
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -85,13 +86,11 @@ def read_png(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            picture = imageio.imread(content, extension=".png")
+            with Image.open(BytesIO(content), formats=["PNG"]) as picture:
+                return np.array(picture.convert("RGB"))
     except Exception as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        reason = " ".join(str(error).split())[:200]
         raise UserError(f"{path}: expected a PNG picture, got {reason}. Try: delete it") from error
-    if picture.ndim != 3 or picture.shape[2] < 3 or picture.dtype != np.uint8:
-        raise UserError(f"{path}: expected a PNG picture in colour, got another one. Try: delete it")
-    return picture[..., :3]
 
 
 def colorize(values: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch h w 3"]:

@@ -67,8 +67,10 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w c"]], *, fps
         try:
             for each in frames:
                 frame = _even(each) if kind.is_halved else each
-                writer = writer or _open(temporary, kind, fps, frame)
-                _append(writer, frame)
+                if writer is None:
+                    writer = _open(temporary, kind, fps, frame)
+                    _send(writer, None)
+                _send(writer, frame)
         finally:
             if writer is not None:
                 writer.close()
@@ -93,39 +95,32 @@ def _open(path: Path, kind: Format, fps: int, frame: UInt8[np.ndarray, "h w c"])
     height, width, channels = frame.shape
     pixels = kind.pixels if channels == 3 else kind.transparent_pixels
     assert pixels is not None, "the exporters refuse transparent frames in other formats"
-    try:
-        writer = imageio_ffmpeg.write_frames(
-            str(path),
-            (width, height),
-            pix_fmt_in="rgb24" if channels == 3 else "rgba",
-            pix_fmt_out=pixels,
-            fps=fps,
-            codec=kind.codec,
-            # The options choose the quality.
-            quality=None,  # pyright: ignore[reportArgumentType]  (its default is a number)
-            # The frames already have even sizes. The default of 16 would rescale them.
-            macro_block_size=1,
-            # Palettes have equal colours in flat pictures, of which ffmpeg would warn.
-            ffmpeg_log_level="error",
-            output_params=list(kind.options),
-        )
-        writer.send(None)
-    except (RuntimeError, OSError) as error:
-        raise _ffmpeg_error(error) from error
-    return writer
+    return imageio_ffmpeg.write_frames(
+        str(path),
+        (width, height),
+        pix_fmt_in="rgb24" if channels == 3 else "rgba",
+        pix_fmt_out=pixels,
+        fps=fps,
+        codec=kind.codec,
+        # The options choose the quality.
+        quality=None,  # pyright: ignore[reportArgumentType]  (its default is a number)
+        # The frames already have even sizes. The default of 16 would rescale them.
+        macro_block_size=1,
+        # Palettes have equal colours in flat pictures, of which ffmpeg would warn.
+        ffmpeg_log_level="error",
+        output_params=list(kind.options),
+    )
 
 
-def _append(writer, frame: UInt8[np.ndarray, "h w c"]) -> None:
+def _send(writer, frame: UInt8[np.ndarray, "h w c"] | None) -> None:
+    """Send a frame to ffmpeg, which starts with the first one, or None to begin."""
     try:
-        writer.send(np.ascontiguousarray(frame))
-    # ffmpeg starts with the first video frame, so a broken one fails here.
+        writer.send(None if frame is None else np.ascontiguousarray(frame))
     except (RuntimeError, OSError, StopIteration) as error:
         raise _ffmpeg_error(error) from error
 
 
 def _ffmpeg_error(reason: object) -> UserError:
     first_line = next(iter(str(reason).strip().splitlines()), "unknown reason")
-    return UserError(
-        f"video: ffmpeg is missing or does not work ({first_line}). The variable $IMAGEIO_FFMPEG_EXE "
-        "chooses another one. Try: pip install --force-reinstall imageio-ffmpeg"
-    )
+    problem = f"video: ffmpeg is missing or does not work ({first_line})"
+    return UserError(f"{problem}. Try: pip install --force-reinstall imageio-ffmpeg")

@@ -81,15 +81,3 @@ def test_without_the_package_the_message_names_the_extra(tmp_path, monkeypatch, 
     message = rf"exporter\.{kind}: needs gaussforge, which is not installed\. {hint}"
     with pytest.raises(UserError, match=message):
         WRITERS[kind](tmp_path / "a", random_gaussians(3), up="-y")
-
-
-def test_a_broken_installation_is_one_message(tmp_path, monkeypatch):
-    def fails(name):
-        raise ImportError("no symbol")
-
-    monkeypatch.setattr(gaussforge, "import_module", fails)
-    message = (
-        r"^exporter\.sog: gaussforge is installed but cannot be imported \(no symbol\)\. Try: pip install "
-    )
-    with pytest.raises(UserError, match=message):
-        write_sog(tmp_path / "a", random_gaussians(3), up="-y")
