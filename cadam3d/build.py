@@ -17,7 +17,6 @@ from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
 from cadam3d.core.checks import fail, require, require_choice, require_whole
 from cadam3d.core.errors import UserError
-from cadam3d.core.memory import CAMERA, PIXEL, require_memory
 from cadam3d.core.schedule import FAR_STEP
 from cadam3d.densifier.base import Densifier
 from cadam3d.densifier.baseline import Baseline
@@ -63,7 +62,7 @@ def build_trainer(
         got=refine.steps,
         example="refine.steps='${steps}'",
     )
-    trainer = Trainer(
+    return Trainer(
         steps=cfg.steps,
         views=cfg.views,
         camera=part("camera", CameraSampler),
@@ -79,9 +78,6 @@ def build_trainer(
         regularizers=components(cfg.regularizer, Regularizer, "regularizer"),
         callbacks=[*components(cfg.callback, Callback, "callback").values(), *callbacks],
     )
-    # The camera has checked its size by now, so that too many views are the only possible reason.
-    require_views(cfg)
-    return trainer
 
 
 def require_unused(cfg: DictConfig) -> None:
@@ -93,15 +89,6 @@ def require_unused(cfg: DictConfig) -> None:
     require(is_node, key, expected="the keys of a node", got=published, example=example)
     target = {TARGET: f"{Baseline.__module__}.{Baseline.__name__}", "screen_px": None}
     component(_node_at(key, target | _content(published, key)), Baseline, key)
-
-
-def require_views(cfg: DictConfig) -> None:
-    """Raise ``UserError`` if the images of one step cannot fit into memory."""
-    # A camera from elsewhere may use this key differently, or may have no such key.
-    size = cfg.camera.get("size")
-    size = size if isinstance(size, int) and size > 0 else 1
-    require_memory("camera.size", size, unit=PIXEL, power=2)
-    require_memory("views", cfg.views, unit=max(CAMERA, PIXEL * float(size) ** 2))
 
 
 def component(node: Any, kind: type = object, key: str = CONFIGURATION) -> Any:

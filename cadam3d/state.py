@@ -1,6 +1,5 @@
 """TrainState: everything that a run needs to continue, and the reports that callbacks see."""
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,12 +11,13 @@ from torch import Tensor
 
 from cadam3d.core.checks import require
 from cadam3d.core.edit import RowEdit, RowState
+from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.outcome import Outcome
 from cadam3d.core.rendering import RenderFn
 from cadam3d.core.sh import MAX_DEGREE
 from cadam3d.densifier.base import Densifier
-from cadam3d.optimizer import MOMENTS, AdamSettings, GaussianOptimizer, parts_of
+from cadam3d.optimizer import AdamSettings, GaussianOptimizer
 from cadam3d.rasterizer.base import Rasterizer
 
 __all__ = ["Outcome", "Population", "RefineReport", "RunContext", "StepReport", "TrainState"]
@@ -35,16 +35,13 @@ GENERATORS = (
     "augmentation",
 )
 # The entries of a checkpoint that are neither tensors nor dicts.
-PLAIN = ("step", "seconds", "num_initial", "initial_note", "skipped", "dimmed", "refused", "seed")
-SH_SIZES = tuple((degree + 1) ** 2 for degree in range(MAX_DEGREE + 1))
-# Limits of what a checkpoint may claim. Nothing real comes near them.
-MOST_STEPS = 10**12
-MOST = 10**4000  # for a seed too; Python refuses to write much longer numbers
-LONGEST_NOTE = 10_000  # characters
+COUNTS = ("step", "num_initial", "skipped", "dimmed", "seed")
+PLAIN = (*COUNTS, "seconds", "initial_note", "refused")
+MOST = 10**4000  # Python refuses to write much longer numbers
 
 
 class PayloadError(ValueError):
-    """An entry of a checkpoint that training cannot have written; the text names it and what was expected."""
+    """A checkpoint that training cannot have written."""
 
 
 @dataclass
@@ -88,27 +85,28 @@ class TrainState:
     ) -> "TrainState":
         """Return the state on ``device`` that :meth:`to_payload` described.
 
-        Raises ``PayloadError`` if any entry is not what :meth:`to_payload` writes, and ``UserError`` if the
-        checkpoint belongs to another kind of densifier.
+        Raises ``PayloadError`` if its entries, types or shapes are not those that :meth:`to_payload` writes,
+        and ``UserError`` if the checkpoint belongs to another kind of densifier.
         """
-        blank = densifier.init_state(0, torch.device("cpu"))
-        _require_like("", payload, _template(payload, densifier))
-        rows = type(blank)(**payload["densifier"])
-        _require_reachable(payload, rows)
-        owner = optimizer.start(Gaussians(**payload["gaussians"]).to(device))
-        owner.load_state_dict(payload["optimizer"])
-        generators = start_generators(payload["seed"])
-        for name, generator in generators.items():
-            try:
+        # A damaged payload may raise anything.
+        try:
+            _require_sound(payload, optimizer, densifier)
+            owner = optimizer.start(Gaussians(**payload["gaussians"]).to(device))
+            owner.load_state_dict(payload["optimizer"])
+            rows = {name: tensor.to(device) for name, tensor in payload["densifier"].items()}
+            generators = start_generators(payload["seed"])
+            for name, generator in generators.items():
                 generator.set_state(payload["generators"][name])
-            except RuntimeError as error:
-                raise PayloadError(f"generators.{name}: expected the state of a generator") from error
-        return cls(
-            **{name: payload[name] for name in PLAIN},
-            optimizer=owner,
-            densifier=type(rows)(**{name: tensor.to(device) for name, tensor in rows.to_dict().items()}),
-            generators=generators,
-        )
+            return cls(
+                **{name: payload[name] for name in PLAIN},
+                optimizer=owner,
+                densifier=type(densifier.init_state(0, device))(**rows),
+                generators=generators,
+            )
+        except UserError:
+            raise
+        except Exception as error:
+            raise PayloadError(error) from error
 
 
 @dataclass(frozen=True)
@@ -176,81 +174,38 @@ def start_generators(seed: int) -> dict[str, torch.Generator]:
     }
 
 
-def _template(payload: Any, densifier: Densifier) -> dict[str, Any]:
-    """Return what a checkpoint holds that is as large as ``payload`` claims to be: the types and the shapes.
-
-    Raises ``PayloadError`` if it claims no size, and ``UserError`` if it belongs to another densifier.
-    """
-    sh, rows = _entry(_entry(payload, "gaussians"), "sh"), _entry(payload, "densifier")
-    _require(type(sh) is Tensor and sh.ndim == 3, "gaussians.sh", "a tensor of 3 axes")
-    n, coefficients, _ = sh.shape
-    _require(coefficients in SH_SIZES, "gaussians.sh", f"one of {SH_SIZES} coefficients")
-    shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "opacity_logits": (n,)}
-    shapes["sh"] = (n, coefficients, 3)
-    # One number, repeated without memory.
-    gaussians = Gaussians(**{name: torch.zeros(()).expand(shape) for name, shape in shapes.items()})
-    blank = densifier.init_state(n, torch.device("meta")).to_dict()
-    _require(type(rows) is dict and all(type(name) is str for name in rows), "densifier", "names and tensors")
+def _require_sound(payload: Any, optimizer: AdamSettings, densifier: Densifier) -> None:
+    """Raise an exception unless a payload has the entries, types and shapes of a run of its size."""
+    gaussians, note = Gaussians(**payload["gaussians"]), payload["initial_note"]
+    n, k = len(gaussians), (min(gaussians.sh_degree, MAX_DEGREE) + 1) ** 2
+    shapes = (n, 3), (n, 3), (n, 4), (n,), (n, k, 3)
+    blank = Gaussians(*(torch.empty(shape, device="meta") for shape in shapes))
+    rows = densifier.init_state(n, blank.device).to_dict()
     require(
-        sorted(blank) == sorted(rows),
+        sorted(rows) == sorted(payload["densifier"]),
         "densifier",
-        expected=f"the one of the checkpoint (state: {sorted(rows)})",
-        got=sorted(blank),
+        expected=f"the one of the checkpoint (state: {sorted(payload['densifier'])})",
+        got=sorted(rows),
         example="resume without densifier=...",
     )
-    return {
-        **dict.fromkeys(("step", "num_initial", "skipped", "dimmed", "seed"), 0),
+    template = {
+        **dict.fromkeys(COUNTS, 0),
         "seconds": 0.0,
-        "initial_note": None,
+        "initial_note": note if isinstance(note, str) and note.isprintable() else None,
         "refused": False,
-        "gaussians": gaussians.tensors(),
-        "optimizer": {"steps": 0, **dict.fromkeys(MOMENTS, parts_of(gaussians))},
-        "densifier": blank,
-        "generators": dict.fromkeys(GENERATORS, torch.Generator().get_state()),
+        "gaussians": blank.tensors(),
+        "optimizer": optimizer.start(blank).state_dict(),
+        "densifier": rows,
+        "generators": {name: draw.get_state() for name, draw in start_generators(0).items()},
     }
+    if _form(payload) != _form(template) or not all(
+        0 <= payload[name] < MOST for name in (*COUNTS, "seconds")
+    ):
+        raise PayloadError("its entries are not those of a run")
 
 
-def _entry(entries: Any, name: str) -> Any:
-    _require(type(entries) is dict and name in entries, name, "an entry")
-    return entries[name]
-
-
-def _require_like(name: str, value: Any, like: Any) -> None:
-    """Raise ``PayloadError`` unless ``value`` has the structure, the types and the shapes of ``like``.
-
-    Numbers are finite, and those that are not in tensors are not negative.
-    """
-    if isinstance(like, dict):
-        is_dict = type(value) is dict and all(type(key) is str for key in value)
-        wanted = f"the entries {', '.join(sorted(like))}"
-        _require(is_dict and sorted(value) == sorted(like), name or "the checkpoint", wanted)
-        for key, each in like.items():
-            _require_like(f"{name}.{key}".lstrip("."), value[key], each)
-    elif isinstance(like, Tensor):
-        wanted = f"{str(like.dtype).removeprefix('torch.')} of shape {tuple(like.shape)}, all finite"
-        is_dense = type(value) is Tensor and value.layout is torch.strided and value.device.type != "meta"
-        _require(is_dense and value.dtype == like.dtype and value.shape == like.shape, name, wanted)
-        _require(bool(value.isfinite().all()), name, wanted)
-    elif like is None:
-        is_note = type(value) is str and len(value) <= LONGEST_NOTE and value.isprintable()
-        _require(value is None or is_note, name, "a printable text or nothing")
-    else:
-        is_alike = type(value) is type(like) and 0 <= value < (math.inf if type(like) is float else MOST)
-        _require(is_alike, name, f"a {type(like).__name__} in its range")
-
-
-def _require_reachable(payload: dict[str, Any], rows: RowState) -> None:
-    """Raise ``PayloadError`` unless as many steps as were done can lead to the other numbers."""
-    step = payload["step"]
-    _require(step <= MOST_STEPS, "step", "a number of steps")
-    for name in ("skipped", "dimmed"):
-        _require(payload[name] <= step, name, f"at most {step}")
-    _require(payload["optimizer"]["steps"] <= step, "optimizer.steps", f"at most {step}")
-    for name, squared in payload["optimizer"]["exp_avg_sq"].items():
-        _require(bool((squared >= 0).all()), f"optimizer.exp_avg_sq.{name}", "numbers >= 0")
-    _require(rows.is_possible(step), "densifier", f"numbers that {step} steps can lead to")
-
-
-def _require(claim: bool, name: str, expected: str) -> None:
-    if not claim:
-        raise PayloadError(f"{name}: expected {expected}")
+def _form(value: Any) -> Any:
+    """Return the structure of a payload: the names of its entries, and their types and shapes."""
+    if isinstance(value, dict):
+        return {name: _form(entry) for name, entry in value.items()}
+    return (value.dtype, value.shape) if isinstance(value, Tensor) else type(value)

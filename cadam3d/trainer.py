@@ -98,7 +98,7 @@ class Trainer:
 
     def __post_init__(self) -> None:
         require_range("steps", self.steps, low=1)
-        require_range("views", self.views, low=1)
+        require_range("views", self.views, low=1, high=10_000)
         self.camera.check_views(self.views)
 
     def step(self, state: TrainState, embedding: PromptEmbedding) -> tuple[StepReport, RefineReport | None]:

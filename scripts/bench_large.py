@@ -13,6 +13,7 @@ With --memory, the table shows how far a pass raises the peak of resident memory
 """
 
 import argparse
+import ctypes
 import json
 import os
 import resource
@@ -30,6 +31,8 @@ import measuring
 SCRIPTS = Path(__file__).resolve().parent
 # Passes of a process. The first ones are not counted, because they get memory from the system.
 PASSES, WARM_UP = 3, 2
+# The stages of a pass, in the order of ``enum Stage`` in cadam3d/rasterizer/kernels/cpu.cpp.
+STAGES = ("project", "order", "lists", "blend", "blend backward", "gather", "centre backward")
 
 
 @dataclass(frozen=True)
@@ -172,22 +175,28 @@ def measure_peak(case: Case, threads: int) -> dict[str, Any]:
 
 def time_pass(rasterizer: Any, scene: Any) -> dict[str, Any]:
     """Return the milliseconds of a render, of its backward pass, and of the stages of the kernels."""
-    from cadam3d.rasterizer import cpu
-
     scene.zero_grad()
     start = time.perf_counter()
     output = rasterizer.render(scene.gaussians, scene.cameras, scene.background)
     middle = time.perf_counter()
     scene.backward((output.rgb, output.alpha, output.depth))
     end = time.perf_counter()
-    # An older checkout has no costs.
-    stages = cpu.pass_costs(output).seconds if hasattr(cpu, "pass_costs") else {}
+    stages = stage_seconds(output)
     return {
         "forward": 1e3 * (middle - start),
         "backward": 1e3 * (end - middle),
         "both": 1e3 * (end - start),
         "stages": {name: 1e3 * seconds for name, seconds in stages.items()},
     }
+
+
+def stage_seconds(output: Any) -> dict[str, float]:
+    """Return the wall-clock time of each stage of the pass that made ``output``, which needs a gradient."""
+    # The node of the graph is the context of ``rasterizer/native.py``, which holds the pass.
+    run = output.rgb.grad_fn.kernels
+    seconds, counts = (ctypes.c_double * len(STAGES))(), (ctypes.c_int64 * 3)()
+    run.kernels.cadam3d_measure(run.handle, seconds, counts)
+    return dict(zip(STAGES, seconds, strict=True))
 
 
 def resident_bytes(reset: bool = False) -> int:

@@ -14,7 +14,6 @@ import torch
 from cadam3d.build import component
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.densifier.base import RowCount
 from cadam3d.densifier.cadam import CAdamState
 from cadam3d.io.checkpoint import FORMAT, VERSION, DamagedCheckpointError, load_checkpoint, save_checkpoint
 from cadam3d.settings.compose import compose
@@ -91,27 +90,17 @@ def damages(value: Any) -> dict[str, Any]:
         "keys": {1: 2},
     }
     if isinstance(value, torch.Tensor):
-        as_float = value.float()
         wrong = {name: item for name, item in wrong.items() if name != "empty tensor"} | {
             "double": value.double(),
             "half": value.half(),
             "long": value.long(),
             "boolean": value.bool(),
-            "complex": value.to(torch.complex64),
             "one row less": value[:-1],
             "one row more": torch.cat([value, value[:1]]),
             "no rows": value[:0],
             "one more axis": value[None],
             "flat": value.flatten()[:-1],
             "expanded": value.flatten()[:1].expand(10**9),
-            "negative numbers": -as_float - 1,
-            "not a number": torch.full_like(as_float, float("nan")),
-            "infinite": torch.full_like(as_float, float("inf")),
-            "below zero": torch.full_like(as_float, float("-inf")),
-            "sparse": as_float.to_sparse(),
-            "meta": torch.empty(value.shape, device="meta"),
-            "parameter": torch.nn.Parameter(as_float),
-            "numpy": as_float.numpy(),
         }
         if value.ndim > 1:
             wrong |= {"transposed": value.transpose(0, 1)}
@@ -145,7 +134,6 @@ def test_every_damaged_entry_is_refused_or_restored_as_it_is(trained):
     state, optimizer, densifier = trained
     payload = state.to_payload()
     assert is_same(TrainState.restore(payload, optimizer, densifier, CPU).to_payload(), payload)
-    accepted = []
     for path in paths(payload):
         value = payload
         for key in path:
@@ -157,14 +145,6 @@ def test_every_damaged_entry_is_refused_or_restored_as_it_is(trained):
             except (PayloadError, UserError):
                 continue
             assert is_same(restored.to_payload(), changed), (path, name)
-            accepted.append((".".join(path), name))
-    # These are what training might have written there.
-    plausible = {("seconds", "fraction"), ("initial_note", "nothing"), ("initial_note", "text")}
-    plausible |= {("refused", "truth")}
-    may_be_negative = {f"gaussians.{name}" for name in payload["gaussians"]} | {"densifier.m"}
-    may_be_negative |= {f"optimizer.exp_avg.{name}" for name in payload["optimizer"]["exp_avg"]}
-    plausible |= {(path, "negative numbers") for path in may_be_negative}
-    assert set(accepted) == plausible
 
 
 @pytest.mark.parametrize("group", [(), ("gaussians",), ("optimizer",), ("densifier",), ("generators",)])
@@ -179,22 +159,6 @@ def test_a_payload_of_another_kind_is_refused(trained, content):
     _, optimizer, densifier = trained
     with pytest.raises(PayloadError):
         TrainState.restore(content, optimizer, densifier, CPU)
-
-
-@pytest.mark.parametrize("entry", [("skipped", 10), ("dimmed", 10), ("seed", -1), ("step", 10**15)])
-def test_numbers_that_contradict_each_other_are_refused(trained, entry):
-    state, optimizer, densifier = trained
-    with pytest.raises(PayloadError, match=entry[0]):
-        TrainState.restore(replaced(state.to_payload(), entry[:1], entry[1]), optimizer, densifier, CPU)
-
-
-def test_states_that_training_cannot_reach_are_refused(trained):
-    state, optimizer, densifier = trained
-    payload = state.to_payload()
-    for name, wrong in (("v", -payload["densifier"]["v"]), ("age", payload["densifier"]["age"] + 3)):
-        with pytest.raises(PayloadError, match="9 steps can lead to"):
-            TrainState.restore(replaced(payload, ("densifier", name), wrong), optimizer, densifier, CPU)
-    assert not RowCount(no_rows=torch.tensor([False, True])).is_possible(1)
 
 
 def archive(path: Path, payload: Any) -> Path:

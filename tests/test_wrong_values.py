@@ -15,10 +15,10 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d import cli
-from cadam3d.build import build_trainer, component, components, require_unused, require_views
+from cadam3d.build import build_trainer, component, components, require_unused
 from cadam3d.commands.messages import keeping_others
 from cadam3d.core.errors import UserError
-from cadam3d.core.memory import is_out_of_memory, require_memory
+from cadam3d.core.memory import is_out_of_memory
 from cadam3d.settings.check import require_settings
 from cadam3d.settings.compose import compose
 from cadam3d.settings.options import config_dir
@@ -292,23 +292,6 @@ def test_the_jobs_of_a_sweep_are_counted_before_they_are_made():
 
 
 # --- memory ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("size", "views", "blamed"),
-    [(10**9, 1, "camera.size"), (10**400, 2, "camera.size"), (64, 10**12, "views")],
-)
-def test_the_setting_that_asks_for_too_much_memory_is_named(size, views, blamed):
-    cfg = OmegaConf.create({"camera": {"size": size}, "views": views})
-    with pytest.raises(UserError, match=rf"^{blamed}: "):
-        require_views(cfg)
-
-
-def test_a_size_is_refused_only_if_it_cannot_work():
-    require_memory("camera.size", 4096, unit=20, power=2)
-    for value in (10**7, 10**30):
-        with pytest.raises(UserError, match=r"^camera\.size: expected at most \d+, "):
-            require_memory("camera.size", value, unit=20, power=2)
 
 
 @pytest.mark.parametrize("error", [MemoryError(), torch.OutOfMemoryError("out of memory"), UserError("a: b")])

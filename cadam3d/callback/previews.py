@@ -5,7 +5,6 @@ from typing import ClassVar
 
 from cadam3d.callback.base import Callback
 from cadam3d.core.checks import require_range, require_whole
-from cadam3d.core.memory import PIXEL
 from cadam3d.core.pictures import PictureSettings
 from cadam3d.io.image import contact_sheet, drop_step_pictures, step_picture, write_png
 from cadam3d.io.run_folder import PREVIEWS
@@ -29,7 +28,7 @@ class Previews(PictureSettings, Callback):
         super().__post_init__()
         if self.every is not None:
             require_whole("callback.previews.every", self.every, low=1)
-        self.require_views(self.views, bytes_each=PIXEL * float(self.size) ** 2)
+        self.require_views(self.views)
         require_range("callback.previews.elevation_deg", self.elevation_deg, low=-90, high=90)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:

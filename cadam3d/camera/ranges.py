@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.checks import are_numbers, require, require_choice, require_whole
-from cadam3d.core.memory import PIXEL, require_memory
+from cadam3d.core.pictures import MOST_PIXELS
 from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 
 ELEVATION_LAWS = ("uniform", "sphere", "mixture")
@@ -46,12 +46,11 @@ def image_size(size: int | Schedule, step: int) -> int:
 
 
 def require_size(size: int | Schedule) -> None:
-    """Raise ``UserError`` unless ``size`` is a schedule or a whole number of pixels that fits into memory."""
+    """Raise ``UserError`` unless ``size`` is a schedule or a whole number of pixels."""
     if isinstance(size, Schedule):
         require_scheduled("camera.size", size, low=1)
     else:
-        require_whole("camera.size", size, low=1)
-        require_memory("camera.size", size, unit=PIXEL, power=2)
+        require_whole("camera.size", size, low=1, high=MOST_PIXELS)
 
 
 def require_interval(key: str, interval: object, *, low: float, high: float) -> None:

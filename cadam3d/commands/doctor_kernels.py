@@ -130,7 +130,7 @@ def _choice(device: torch.device) -> Finding:
     if backend.reason is None:
         return Finding("rasterizer=auto", Verdict.OK, f"{chosen}: the fastest there is, and it works")
     first, *others = backend.reason.splitlines()
-    return Finding("rasterizer=auto", Verdict.NOTE, f"{chosen}{backend.remark}: {first}", *others[-1:])
+    return Finding("rasterizer=auto", Verdict.NOTE, f"{chosen}: {first}", *others[-1:])
 
 
 def _tracer() -> Finding:

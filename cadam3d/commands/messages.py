@@ -51,4 +51,4 @@ def note(text: str) -> None:
 def note_backend(backend: Backend) -> None:
     """Print a note if another backend renders because a faster one is not available."""
     if backend.reason:
-        note(f"rendering with rasterizer={backend.name}{backend.remark}: {backend.reason}")
+        note(f"rendering with rasterizer={backend.name}: {backend.reason}")

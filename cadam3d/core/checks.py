@@ -96,10 +96,10 @@ def _written(choice: object) -> str:
     return str(choice).lower() if isinstance(choice, bool) else str(choice)
 
 
-def require_color(key: str, value: object) -> None:
-    """Raise :class:`UserError` unless ``value`` is an RGB colour: three numbers in [0, 1]."""
+def require_color(key: str, value: object, *, otherwise: str = "") -> None:
+    """Raise unless ``value`` is an RGB colour, three numbers in [0, 1]; the message adds ``otherwise``."""
     is_color = are_numbers(value, low=0, high=1) and len(value) == 3
-    require(is_color, key, expected="three numbers in [0, 1]", got=value)
+    require(is_color, key, expected=f"three numbers in [0, 1]{otherwise}", got=value)
 
 
 def are_numbers(value: object, *, low: float, high: float) -> TypeGuard[Sequence[float]]:

@@ -54,13 +54,6 @@ class RowState:
         """Return the state after ``edit``."""
         return type(self)(**{field.name: edit.carry(getattr(self, field.name)) for field in fields(self)})
 
-    def is_possible(self, step: int) -> bool:
-        """Return whether ``step`` steps of training can lead to these numbers, which are finite.
-
-        A checkpoint with an impossible state is refused. By default every state is possible.
-        """
-        return True
-
     def to_dict(self) -> dict[str, Tensor]:
         """Return the tensors by name, for a checkpoint."""
         return {field.name: getattr(self, field.name) for field in fields(self)}

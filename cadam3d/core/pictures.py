@@ -13,10 +13,10 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, orbit, turntable
 from cadam3d.core.checks import are_numbers, require, require_color, require_range, require_whole
-from cadam3d.core.memory import CAMERA, PIXEL, require_memory
 
-# Pictures of one asset; far more than anyone looks at.
-MOST_VIEWS = 100_000
+# Far more than anyone looks at.
+MOST_VIEWS = 10_000  # pictures of one asset
+MOST_PIXELS = 16_384  # along the edge of a picture
 TRANSPARENT = "transparent"
 
 
@@ -34,8 +34,7 @@ class ViewSettings:
     def __post_init__(self) -> None:
         require_range(f"{self.node}.distance", self.distance, above=0)
         require_range(f"{self.node}.fov_y_deg", self.fov_y_deg, above=0, below=180)
-        require_whole(f"{self.node}.size", self.size, low=1)
-        require_memory(f"{self.node}.size", self.size, unit=PIXEL, power=2)
+        require_whole(f"{self.node}.size", self.size, low=1, high=MOST_PIXELS)
 
     def ring(self, views: int, elevation_deg: float) -> Cameras:
         """Return ``views`` cameras evenly spaced over one full turn, starting at the front."""
@@ -54,13 +53,9 @@ class ViewSettings:
             azimuths_deg, elevations_deg, full * self.distance, full * self.fov_y_deg, self.size, self.size
         )
 
-    def require_views(self, views: int, *, bytes_each: float = 0) -> None:
-        """Raise ``UserError`` unless ``views`` is at least 1 and that many cameras fit into memory.
-
-        ``bytes_each`` is the memory that every view needs until all are done, in addition to its camera.
-        """
+    def require_views(self, views: int) -> None:
+        """Raise ``UserError`` unless ``views`` is a reasonable number of pictures."""
         require_whole(f"{self.node}.views", views, low=1, high=MOST_VIEWS)
-        require_memory(f"{self.node}.views", views, unit=CAMERA + bytes_each)
 
     def require_angles(self, name: str, angles_deg: object, *, limit: int) -> None:
         """Raise ``UserError`` unless setting ``name`` is a list of angles in [-limit, limit] degrees."""
@@ -99,12 +94,8 @@ class CutoutSettings(ViewSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        key = f"{self.node}.background"
-        is_color = are_numbers(self.background, low=0, high=1) and len(self.background) == 3
-        expected = f"three numbers in [0, 1] or {TRANSPARENT}"
-        example = f"{key}={TRANSPARENT}" if isinstance(self.background, str) else f"'{key}=[0.5,0.5,0.5]'"
-        is_known = is_color or self.is_transparent
-        require(is_known, key, expected=expected, got=self.background, example=example)
+        if not self.is_transparent:
+            require_color(f"{self.node}.background", self.background, otherwise=f" or {TRANSPARENT}")
 
     @property
     def is_transparent(self) -> bool:

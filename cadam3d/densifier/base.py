@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cadam3d.core.chart import Chart
-from cadam3d.core.checks import require
 from cadam3d.core.edit import RowEdit, RowState
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderOutput
@@ -66,10 +65,6 @@ class RowCount(RowState):
     def of(cls, n: int, device: torch.device) -> "RowCount":
         """Return the state of ``n`` Gaussians."""
         return cls(no_rows=torch.zeros(n, dtype=torch.bool, device=device))
-
-    def is_possible(self, step: int) -> bool:
-        """Return whether the mask marks no Gaussian."""
-        return not bool(self.no_rows.any())
 
 
 class Densifier(ABC, Generic[State]):
@@ -140,16 +135,10 @@ class Densifier(ABC, Generic[State]):
 
         A densifier with its own "how" overrides this. Only ``generator`` (on the CPU) is changed.
         """
-        selected, n = self.select(state, step, generator), len(gaussians)
+        selected = self.select(state, step, generator)
         # A mask of another shape could be broadcast, and a wrong choice would not show.
-        form = getattr(selected, "dtype", type(selected)), tuple(getattr(selected, "shape", ()))
-        require(
-            form == (torch.bool, (n,)),
-            f"densifier {type(self).__name__}",
-            expected=f"a mask from select: a tensor of bool of shape ({n},)",
-            got=form,
-            example="densifier=cadam",
-        )
+        assert selected.dtype == torch.bool, "select returns a mask"
+        assert selected.shape == (len(gaussians),), "select returns a mask with one row per Gaussian"
         return refine.plan(gaussians, selected, step, generator, self.unwanted(state))
 
     def after_reset(self, state: State, rows: Bool[Tensor, "n"]) -> State:

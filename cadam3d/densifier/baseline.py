@@ -13,7 +13,6 @@ from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 from cadam3d.densifier.base import Densifier, GradientSignal
 
 VIEWS = ("sum_norm", "sum_vector", "last")
-MOST_SIGHTINGS = 1 << 30  # more than any run has views
 
 
 @dataclass
@@ -23,11 +22,6 @@ class BaselineState(RowState):
     norm_sum: Float[Tensor, "n"]  # of view-space gradients; loss per NDC unit
     sightings: Int[Tensor, "n"]  # number of norms added
     radius: Float[Tensor, "n"]  # the largest on screen, in pixels
-
-    def is_possible(self, step: int) -> bool:
-        """Return whether no sum, count or radius is negative, and no count is beyond any run."""
-        is_count = (self.sightings >= 0) & (self.sightings <= MOST_SIGHTINGS)
-        return bool((self.norm_sum >= 0).all() & is_count.all() & (self.radius >= 0).all())
 
     def carry(self, edit: RowEdit) -> "BaselineState":
         """Return zeros for survivors too, because 3DGS averages over one refinement interval at a time."""

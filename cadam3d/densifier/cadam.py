@@ -38,10 +38,6 @@ class CAdamState(RowState):
         """Return ``sqrt(||v_hat||_1)`` (eq. 10)."""
         return (self.v.sum(dim=-1) / bias_correction(beta2, self.age)).sqrt()
 
-    def is_possible(self, step: int) -> bool:
-        """Return whether squares are not negative and no Gaussian is older than the run."""
-        return bool((self.v >= 0).all() & (self.age >= 0).all() & (self.age <= step).all())
-
 
 @dataclass(frozen=True, kw_only=True)
 class CAdam(CAdamCharts[CAdamState]):

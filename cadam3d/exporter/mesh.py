@@ -7,16 +7,12 @@ from typing import ClassVar
 from cadam3d.core.checks import require_choice, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.memory import require_memory
 from cadam3d.core.mesh.surface import SurfaceSettings
 from cadam3d.core.rendering import RenderFn
 from cadam3d.exporter.base import Contents, Exporter
 from cadam3d.io.atlas import paint, require_xatlas
 from cadam3d.io.frames import UPS
-from cadam3d.io.mesh import FORMATS, mesh_facts, write_glb, write_mesh_ply, write_obj
-
-# Bytes for each texel while a texture is painted, at least.
-TEXEL_BYTES = 40
+from cadam3d.io.mesh import FORMATS, read_mesh, write_glb, write_mesh_ply, write_obj
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +39,6 @@ class MeshExporter(SurfaceSettings, Exporter):
         if self.texture is None:
             return
         require_whole("exporter.mesh.texture", self.texture, low=64, high=8192)
-        require_memory("exporter.mesh.texture", self.texture, unit=TEXEL_BYTES, power=2)
         if self.format == "ply":
             raise UserError(
                 "exporter.mesh.texture: expected null with format=ply, which has no textures, "
@@ -89,5 +84,7 @@ class MeshExporter(SurfaceSettings, Exporter):
         """
         if path.suffix.removeprefix(".") != self.format:
             return Contents(words="belongs to the mesh")
-        facts = mesh_facts(path)
-        return Contents(words=str(facts), up=self.up, triangles=facts.triangles)
+        mesh = read_mesh(path)
+        closed = "watertight" if mesh.is_watertight else "not watertight"
+        words = f"{len(mesh.faces):,} triangles, {closed}, area {mesh.area:.3g}, volume {mesh.volume:.3g}"
+        return Contents(words=words, up=self.up, triangles=len(mesh.faces))

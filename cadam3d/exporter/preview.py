@@ -36,9 +36,7 @@ class PreviewExporter(PictureSettings, PictureExporter):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.require_angles("elevations_deg", self.elevations_deg, limit=90)
-        # All pictures are kept for the sheet, 12 bytes for each pixel.
-        kept = 12 * float(self.size) ** 2 * len(self.elevations_deg)
-        self.require_views(self.views, bytes_each=kept)
+        self.require_views(self.views)
         require_choice("exporter.preview.labels", self.labels, (True, False))
 
     def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:

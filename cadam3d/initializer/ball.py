@@ -21,7 +21,7 @@ class Ball(FromPoints):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_count(self.count, self.sh_degree)
+        require_count(self.count)
         require_range("initializer.radius", self.radius, above=0, high=1)
         require_range("initializer.color_noise", self.color_noise, low=0, high=1)
         require_color("initializer.color", self.color)

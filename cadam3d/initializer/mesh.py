@@ -48,7 +48,7 @@ class Mesh(FromObject):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_count(self.count, self.sh_degree)
+        require_count(self.count)
         require_choice("initializer.up", self.up, UPS)
         require_color("initializer.color", self.color)
 

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from cadam3d.core.checks import fail, require, require_choice, require_range, require_whole, unless_none
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.memory import require_memory
 from cadam3d.core.sh import MAX_DEGREE, rgb_to_sh0
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.frames import TURNS
@@ -263,18 +262,13 @@ def found_file(path: str) -> Path:
     return found
 
 
-def require_count(count: int, sh_degree: int | None) -> None:
-    """Raise ``UserError`` unless that many Gaussians can be trained in the memory of this machine.
-
-    Each number of a Gaussian is stored with its gradient and its two moments, in single precision.
-    """
-    require_whole("initializer.count", count, low=1)
-    numbers = 11 + 3 * ((sh_degree or 0) + 1) ** 2
-    require_memory("initializer.count", count, unit=16 * numbers)
+def require_count(count: int) -> None:
+    """Raise ``UserError`` unless ``count`` is a number of Gaussians that some machine can train."""
+    require_whole("initializer.count", count, low=1, high=100_000_000)
 
 
 def require_copies(replicate: int, replicate_radius: object, replicate_law: object) -> None:
     """Raise ``UserError`` unless ``replicate`` is at least 1, its radius in (0, 1] and its law known."""
-    require_whole("initializer.replicate", replicate, low=1)
+    require_whole("initializer.replicate", replicate, low=1, high=1000)
     require_range("initializer.replicate_radius", replicate_radius, above=0, high=1)
     require_choice("initializer.replicate_law", replicate_law, REPLICATE_LAWS)

@@ -13,7 +13,6 @@ from torch import Tensor
 from cadam3d.core.checks import require_choice, require_color, require_range, require_whole, unless_none
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.memory import require_memory
 from cadam3d.initializer.base import Beginning, Initializer
 from cadam3d.initializer.points import (
     FromObject,
@@ -79,10 +78,9 @@ class ShapE(FromObject):
         require_choice("initializer.dtype", self.dtype, ("auto", *DTYPES))
         require_whole("initializer.steps", self.steps, low=1, high=1024)
         require_range("initializer.guidance_scale", self.guidance_scale, low=1)
-        require_whole("initializer.grid_size", self.grid_size, low=2)
-        require_memory("initializer.grid_size", self.grid_size, unit=4, power=3)
-        require_count(1 if self.count is None else self.count, self.sh_degree)
-        require_whole("initializer.grow_points", self.grow_points, low=0)
+        require_whole("initializer.grid_size", self.grid_size, low=2, high=1024)
+        require_count(1 if self.count is None else self.count)
+        require_whole("initializer.grow_points", self.grow_points, low=0, high=100_000_000)
         require_range("initializer.grow_distance", self.grow_distance, above=0)
         require_range("initializer.grow_noise", self.grow_noise, low=0, high=1)
         require_choice("initializer.tone", self.tone, TONES)

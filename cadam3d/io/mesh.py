@@ -9,6 +9,7 @@ red green blue``) are sRGB by convention.
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as imageio
 import numpy as np
@@ -17,7 +18,7 @@ from jaxtyping import Float, Int, UInt8
 
 from cadam3d import __version__
 from cadam3d.core.errors import UserError
-from cadam3d.core.mesh.surface import Surface, SurfaceFacts, facts
+from cadam3d.core.mesh.surface import Surface
 from cadam3d.io.atomic import replacing
 from cadam3d.io.frames import points_to_file
 from cadam3d.io.gltf import linear, write_gltf
@@ -131,8 +132,8 @@ def write_obj(path: Path, surface: Surface, *, up: str, texture: Texture | None 
     return [path, material, picture]
 
 
-def mesh_facts(path: Path) -> SurfaceFacts:
-    """Return numbers about the mesh in a file of any of the three formats, computed from its triangles.
+def read_mesh(path: Path) -> Any:
+    """Return the mesh in a file of any of the three formats, as trimesh describes it.
 
     Vertices at the same place count as one, because a texture repeats them. Raises ``UserError`` if the file
     cannot be read.
@@ -142,16 +143,15 @@ def mesh_facts(path: Path) -> SurfaceFacts:
     # Every format has its own parser, with its own exceptions.
     try:
         mesh = trimesh.load_mesh(path, process=False)
-        vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-        if len(faces) == 0:
+        if len(mesh.faces) == 0:
             raise ValueError("it has no triangles")
     except Exception as error:
         reason = str(error) or type(error).__name__
         raise UserError(
             f"{path}: expected a mesh, got a file that cannot be read ({reason}). Try: another file"
         ) from error
-    places, position = np.unique(vertices, axis=0, return_inverse=True)
-    return facts(places, position.reshape(-1)[faces])
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    return mesh
 
 
 def _in_file(surface: Surface, up: str, texture: Texture | None) -> _Mesh:

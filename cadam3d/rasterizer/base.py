@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -51,24 +51,9 @@ class Backend:
     # Why nothing faster renders, and what to type; None if nothing faster exists.
     reason: str | None = None
 
-    @property
-    def remark(self) -> str:
-        """Return what a message adds about the speed, with a comma in front; "" for compiled kernels."""
-        return ", which is slow" if self.name == "reference" else ""
-
 
 class Rasterizer(ABC):
     """Renders Gaussians. A component is its hyper-parameters, so it holds no tensors."""
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Let :meth:`render_ahead` follow a :meth:`render` that a subclass overrides alone.
-
-        Training would otherwise use the inherited ``render_ahead``, and thus other images than all else.
-        """
-        super().__init_subclass__(**kwargs)
-        overriding = next(owner for owner in cls.__mro__ if {"render", "render_ahead"} & vars(owner).keys())
-        if "render_ahead" not in vars(overriding):
-            cls.render_ahead = Rasterizer.render_ahead
 
     @abstractmethod
     def render(

@@ -84,29 +84,8 @@ def rasterize(
     return run_pass(_CpuPass(kernels, cameras, absgrad), gaussians, background)
 
 
-# The stages of a pass, in the order of ``enum Stage`` in kernels/cpu.cpp.
-STAGES = ("project", "order", "lists", "blend", "blend backward", "gather", "centre backward")
 # What is wrong, by the ``enum Status`` of the kernels.
 FAILURES = {1: "not enough memory", 2: "2^32 or more pairs of a Gaussian and a tile are too many"}
-
-
-@dataclass(frozen=True)
-class PassCosts:
-    """The costs of one render and its backward pass inside the kernels."""
-
-    seconds: dict[str, float]  # wall clock of each stage so far; small views that run at once add up
-    visible: int  # pairs of a Gaussian and a view
-    slots: int  # pairs of a visible Gaussian and a tile
-    held_bytes: int  # memory of the kernels, including what they may keep for the next pass
-
-
-def pass_costs(output: RenderOutput) -> PassCosts:
-    """Return the costs of a pass of ``rasterizer=cpu`` so far, from its images, which need a gradient."""
-    # The node of the graph is the context of ``native.py``, which holds the pass.
-    kernels = getattr(output.rgb.grad_fn, "kernels", None)
-    if not isinstance(kernels, _CpuPass):
-        raise ValueError("expected images of rasterizer=cpu in float32 that need a gradient")
-    return kernels.costs()
 
 
 class _Scene(ctypes.Structure):
@@ -169,12 +148,6 @@ class _CpuPass(RenderPass):
             "cadam3d_centre_backward", ctypes.byref(scene), self.handle, radii, grad_means2d, grad_means
         )
         return grad_means
-
-    def costs(self) -> PassCosts:
-        """Return what this pass has cost so far."""
-        seconds, counts = (ctypes.c_double * len(STAGES))(), (ctypes.c_int64 * 3)()
-        self.kernels.cadam3d_measure(self.handle, seconds, counts)
-        return PassCosts(dict(zip(STAGES, seconds, strict=True)), *counts)
 
     def scene(self, parameters: list[Tensor], background: Tensor | None) -> _Scene:
         """Return the arguments that all kernels share; they are valid as long as the tensors live."""

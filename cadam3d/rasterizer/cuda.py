@@ -45,7 +45,7 @@ from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.rasterizer.cuda_sort import BLOCK, scan, scan_bytes, sort, sort_bytes, sort_order
 from cadam3d.rasterizer.driver import Driver, Launch, Launcher
 from cadam3d.rasterizer.forecast import Forecast, find_forecast
-from cadam3d.rasterizer.native import RenderPass, outside_of_graphs, require_shapes, run_pass
+from cadam3d.rasterizer.native import RenderPass, require_shapes, run_pass
 from cadam3d.rasterizer.workspace import Workspace, plan
 
 # The kernels define the same constants (kernels/*.cuh).
@@ -119,7 +119,6 @@ def load_kernels(cache_dir: str | None) -> Launcher:
     return Driver(kernels_dir(cache_dir))
 
 
-@outside_of_graphs
 def rasterize(
     launcher: Launcher,
     gaussians: Gaussians,
@@ -148,7 +147,6 @@ def rasterize(
     return run_pass(kernels, gaussians, background)
 
 
-@outside_of_graphs
 def rasterize_ahead(
     launcher: Launcher,
     gaussians: Gaussians,

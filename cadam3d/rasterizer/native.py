@@ -5,9 +5,6 @@ is an ordinary node of the graph: it can retain its gradient, and a loss may use
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from functools import wraps
-from typing import ParamSpec, TypeVar, cast
 
 import torch
 from jaxtyping import Float
@@ -21,9 +18,6 @@ from cadam3d.rasterizer.base import absgrad_probe
 
 # The numbers of coefficients of degree 0 to 3.
 SH_SIZES = (1, 4, 9, 16)
-
-P = ParamSpec("P")
-R = TypeVar("R")
 
 
 class RenderPass(ABC):
@@ -87,23 +81,6 @@ class RenderPass(ABC):
         """Return the gradient of the means that arrives through means2d."""
 
 
-def outside_of_graphs(function: Callable[P, R]) -> Callable[P, R]:
-    """Return the function for callers that ``torch.compile`` compiles: it is called, but not compiled itself.
-
-    Kernels work on addresses, which a compiled graph must not contain. ``torch.compiler.disable`` alone, as a
-    decorator, would do the same, but using it takes a second, which every start of the program would pay.
-    """
-
-    @wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if torch.compiler.is_compiling():
-            return cast(Callable[P, R], torch.compiler.disable(function))(*args, **kwargs)
-        return function(*args, **kwargs)
-
-    return call
-
-
-@outside_of_graphs
 def run_pass(kernels: RenderPass, gaussians: Gaussians, background: Float[Tensor, "v 3"]) -> RenderOutput:
     """Render with the kernels of one pass, with autocast off; see ``Rasterizer.render``."""
     # Entering this context takes longer than all of the ordinary checks together.

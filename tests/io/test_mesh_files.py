@@ -10,10 +10,10 @@ import trimesh
 from PIL import Image
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.mesh.surface import Surface, facts, vertex_normals
+from cadam3d.core.mesh.surface import Surface, vertex_normals
 from cadam3d.io.frames import AXES
 from cadam3d.io.gltf import linear
-from cadam3d.io.mesh import Texture, mesh_facts, write_glb, write_mesh_ply, write_obj
+from cadam3d.io.mesh import Texture, read_mesh, write_glb, write_mesh_ply, write_obj
 
 VERTICES = np.array([[0.6, 0, 0], [0, 0.5, 0], [0, 0, 0.7], [-0.1, -0.2, -0.3]])
 FACES = np.array([[0, 1, 2], [0, 2, 3], [1, 0, 3], [2, 1, 3]])
@@ -81,8 +81,9 @@ def test_trimesh_reads_the_same_triangles_in_the_axes_of_the_file(tmp_path, suff
     np.testing.assert_allclose(mesh.vertices, VERTICES @ np.array(AXES[up]).T, atol=1e-6)
     assert mesh.is_watertight
     assert mesh.volume > 0  # counterclockwise seen from outside, so that nothing is mirrored
-    assert (mesh_facts(path).triangles, mesh_facts(path).watertight) == (4, True)
-    assert mesh_facts(path).volume == pytest.approx(facts(VERTICES, FACES).volume, rel=1e-5)
+    assert (len(read_mesh(path).faces), read_mesh(path).is_watertight) == (4, True)
+    wanted = trimesh.Trimesh(VERTICES, FACES, process=False).volume
+    assert read_mesh(path).volume == pytest.approx(wanted, rel=1e-5)
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply"])
@@ -124,7 +125,7 @@ def test_the_texture_of_a_glb_is_inside_and_the_right_way_up(tmp_path):
     uv, _ = array(tmp_path / "m.glb", "TEXCOORD_0")
     pixel = texture().picture[int(uv[0, 1] * 8), int(uv[0, 0] * 8)]  # glTF counts v from the upper edge
     assert pixel.tolist() == [200, 30, 30]
-    assert mesh_facts(tmp_path / "m.glb").watertight  # although its vertices are repeated
+    assert read_mesh(tmp_path / "m.glb").is_watertight  # although its vertices are repeated
 
 
 def test_an_obj_with_a_texture_has_three_files_that_refer_to_each_other(tmp_path):
@@ -134,8 +135,8 @@ def test_an_obj_with_a_texture_has_three_files_that_refer_to_each_other(tmp_path
     assert mesh.visual.kind == "texture"
     color = mesh.visual.to_color().vertex_colors[0]
     assert color[:3].tolist() == [200, 30, 30]
-    assert mesh_facts(tmp_path / "m.obj") == pytest.approx(mesh_facts(tmp_path / "m.obj"))
-    assert mesh_facts(tmp_path / "m.obj").watertight
+    assert read_mesh(tmp_path / "m.obj") == pytest.approx(read_mesh(tmp_path / "m.obj"))
+    assert read_mesh(tmp_path / "m.obj").is_watertight
 
 
 def test_linear_light_has_the_fixed_points_and_the_slope_of_srgb():
@@ -154,4 +155,4 @@ def test_a_folder_in_place_of_the_file_is_one_message_and_leaves_nothing(tmp_pat
 def test_a_file_that_is_no_mesh_is_one_message(tmp_path, suffix):
     (tmp_path / f"m{suffix}").write_bytes(b"nothing of this kind")
     with pytest.raises(UserError, match="expected a mesh"):
-        mesh_facts(tmp_path / f"m{suffix}")
+        read_mesh(tmp_path / f"m{suffix}")

@@ -3,7 +3,6 @@
 import weakref
 from functools import partial
 
-import jaxtyping
 import pytest
 import torch
 from emulation import Emulator, count_slots, guard_zones, passes
@@ -229,33 +228,6 @@ def test_depths_are_sorted_before_the_host_waits(emulator, monkeypatch):
         views.blend(parameters, scene[2], keeps=False)
     assert events.index("project_forward_4") < events.index("copy") < events.index("sort_scatter")
     assert events.index("sort_scatter") < events.index("wait") < events.index("tile_list")
-
-
-@pytest.mark.slow
-def test_a_compiled_function_may_render(emulator, monkeypatch):
-    """The graph that torch.compile makes ends before rendering and continues after it."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as outside of the test suite
-    gaussians, cameras, background, _ = make_scene(n=20, views=1)
-    render, graphs = partial(rasterize_ahead, emulator), []
-
-    def loss(scale: torch.Tensor) -> torch.Tensor:
-        return render(gaussians.map(lambda tensor: tensor * scale), cameras, background).rgb.sum()
-
-    def backend(graph, _):
-        graphs.append(str(graph.graph))
-        return graph.forward
-
-    torch._dynamo.reset()
-    compiled = torch.compile(loss, backend=backend)
-    for scale in (1.0, 0.9, 0.8):
-        scales = [torch.tensor(scale, requires_grad=True) for _ in range(2)]
-        values = [function(each) for function, each in zip((loss, compiled), scales, strict=True)]
-        for value in values:
-            value.backward()
-        assert torch.equal(*values)
-        assert torch.equal(scales[0].grad, scales[1].grad)
-    assert graphs
-    assert not any("empty" in graph for graph in graphs), "no memory of kernels is in a graph"
 
 
 # -------------------------------------------------------------------------- the default device

@@ -14,10 +14,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cadam3d.core.checks import require_range, require_whole
+from cadam3d.core.checks import fail, require_range, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.memory import require_memory
 from cadam3d.core.mesh.density import BLUR, CUTOFF, Blobs, Lattice, blobs, density, grid_around, near
 from cadam3d.core.sh import evaluate_sh
 
@@ -29,8 +28,6 @@ EXTENT_LEVEL = 0.5  # share of the level that a node next to the surface has at 
 # A box that becomes smaller than this share of the one before may become still smaller.
 SHRINKS = 0.75
 EXTENT_PASSES = 40
-# Bytes per node of the grid, for the density, the labels and marching cubes.
-NODE_BYTES = 24
 # Heights closer to zero are moved away from it.
 LEAST_HEIGHT = 1e-3
 # A simplification that is not watertight is repeated with these settings, and then with more triangles.
@@ -58,24 +55,6 @@ class Surface:
     colors: Float[np.ndarray, "v 3"]  # sRGB in [0, 1]
 
 
-@dataclass(frozen=True)
-class SurfaceFacts:
-    """Numbers about a mesh whose vertices are shared between its triangles."""
-
-    triangles: int
-    parts: int  # connected ones
-    watertight: bool  # every edge belongs to two triangles, which agree about its direction
-    area: float  # world units squared
-    volume: float  # world units cubed; meaningless unless watertight
-
-    def __str__(self) -> str:
-        closed = "watertight" if self.watertight else "not watertight"
-        parts = "1 part" if self.parts == 1 else f"{self.parts} parts"
-        return (
-            f"{self.triangles:,} triangles, {parts}, {closed}, area {self.area:.3g}, volume {self.volume:.3g}"
-        )
-
-
 @dataclass(frozen=True, kw_only=True)
 class SurfaceSettings:
     """Settings of the surface of an asset, which exporters and metrics of meshes inherit."""
@@ -90,7 +69,6 @@ class SurfaceSettings:
 
     def __post_init__(self) -> None:
         require_whole(f"{self.node}.resolution", self.resolution, low=16, high=1024)
-        require_memory(f"{self.node}.resolution", self.resolution, unit=NODE_BYTES, power=3)
         require_range(f"{self.node}.level", self.level, above=0, high=1000)
         require_range(f"{self.node}.smallest_part", self.smallest_part, low=0, below=1)
         if self.triangles is not None:
@@ -145,17 +123,12 @@ class SurfaceSettings:
 
     def _nothing(self, some: Blobs) -> UserError:
         """Return the error for an asset without a surface."""
-        key = f"{self.node}.level"
-        if len(some.rows) == 0:
-            line = "'exporter=[ply]'" if self.node.startswith("exporter.") else "'metric=[size]'"
-            return UserError(
-                f"{self.node}: expected an asset with a surface, got no visible Gaussian. Try: {line}"
-            )
+        most = float(some.opacities.max()) if len(some.rows) else 0.0
         # Between the nodes of the grid, the density may be up to five times higher than at them.
-        reached = float(f"{float(some.opacities.max()) / 5:.1g}")
-        return UserError(
-            f"{key}: expected a level that the density of the asset reaches, got {self.level:g}, "
-            f"which it reaches nowhere. Try: {key}={min(reached, self.level / 2):g}"
+        level = min(float(f"{most / 5:.1g}"), self.level / 2)
+        expected = "a level that the density of the asset reaches"
+        return fail(
+            f"{self.node}.level", expected=expected, got=self.level, example=f"{self.node}.level={level:g}"
         )
 
 
@@ -294,22 +267,9 @@ def compacted(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f 3"]]:
     """Return the mesh without vertices that no triangle uses."""
-    used = np.unique(faces)
-    position = np.zeros(len(vertices), dtype=np.int64)
-    position[used] = np.arange(len(used))
-    return vertices[used], position[faces]
-
-
-def facts(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> SurfaceFacts:
-    """Return numbers about a mesh whose vertices are shared between its triangles."""
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    return SurfaceFacts(
-        triangles=len(faces),
-        parts=len(np.unique(parts_of(len(vertices), faces)[faces[:, 0]])),
-        watertight=is_watertight(faces),
-        area=float(areas(vertices, faces).sum()),
-        volume=float((a * np.cross(b, c)).sum() / 6),
-    )
+    is_used = np.zeros(len(vertices), dtype=bool)
+    is_used[faces] = True
+    return vertices[is_used], (is_used.cumsum() - 1)[faces]
 
 
 def is_watertight(faces: Int[np.ndarray, "f 3"]) -> bool:
