@@ -21,7 +21,7 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderOutput
 from cadam3d.exporter.base import Exporter
-from cadam3d.io.mesh import mesh_facts
+from cadam3d.io.mesh import read_mesh
 from cadam3d.io.ply import read_ply
 from cadam3d.io.run_folder import ASSET, CONFIG
 from cadam3d.metric.mesh import MeshMetric, distances_between, f_score, true_surfaces
@@ -42,7 +42,7 @@ def measure(run: Path, exporter: Exporter, metric: MeshMetric) -> dict[str, obje
         begin = time.process_time()
         [path] = exporter.export(gaussians, no_pictures, Path(folder))
         seconds = time.process_time() - begin
-        facts = mesh_facts(path)
+        mesh = read_mesh(path)
     surface, _ = metric.surface(gaussians)
     scene = build(prompt).to(torch.device("cpu"), torch.float64)
     [truth] = true_surfaces(lambda points: signed_distance(scene, points)[None])
@@ -52,9 +52,9 @@ def measure(run: Path, exporter: Exporter, metric: MeshMetric) -> dict[str, obje
     chamfer = (to_true.mean() + to_mesh.mean()) / 2
     return {
         "prompt": prompt,
-        "triangles": facts.triangles,
-        "parts": facts.parts,
-        "watertight": "yes" if facts.watertight else "no",
+        "triangles": len(mesh.faces),
+        "parts": mesh.body_count,
+        "watertight": "yes" if mesh.is_watertight else "no",
         "Chamfer": f"{chamfer:.4f}",
         "F at 0.01": f"{f_score(to_true, to_mesh, 0.01)[0]:.3f}",
         "F at 0.02": f"{f_score(to_true, to_mesh, 0.02)[0]:.3f}",
