@@ -53,8 +53,7 @@ def _checkout(text: str) -> Path:
     folder = Path(text).resolve()
     # Without this check, Python would import the installed package, and both columns would be the same.
     if not (folder / "cadam3d" / "__init__.py").is_file():
-        message = f"expected a checkout of cadam3d, got {folder}. Try: git worktree add {folder} 994baea"
-        raise argparse.ArgumentTypeError(message)
+        raise argparse.ArgumentTypeError(f"expected a checkout of cadam3d, got {folder}")
     return folder
 
 

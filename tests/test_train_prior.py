@@ -179,8 +179,7 @@ def test_a_training_that_was_interrupted_ends_as_if_it_had_not_been(tmp_path, mo
 # --- the program
 
 
-@pytest.mark.parametrize("processes", [1, 2, 3, 7])
-@pytest.mark.parametrize("files", [1, 2, 5])
+@pytest.mark.parametrize(("files", "processes"), [(1, 3), (2, 2), (5, 3), (5, 7)])
 def test_every_file_is_read_and_no_process_is_without_one(files, processes, tmp_path):
     kind = formats.MVDreamFormat(size=SIZE)
     plan = stages.Plan(tmp_path, tmp_path, files * views.GROUPS, kind, 0, processes, "cpu", None)

@@ -73,7 +73,7 @@ class Densifier(ABC, Generic[State]):
     Every method is pure: it returns a new state and leaves its arguments alone. So a step that fails half way
     has changed nothing, and a step for which the rasterizer had reserved too little memory can be repeated.
     Working in place could save CAdam only a part of 4 ms per million Gaussians on one core, where the
-    cheapest step takes 340 ms (``scripts/bench_densifier.py``).
+    cheapest step takes 340 ms (``docs/method.md``).
     """
 
     @property
