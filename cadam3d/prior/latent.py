@@ -112,7 +112,6 @@ class LatentPrior(DiffusionPrior):
     upcasts: ClassVar[bool]  # whether the autoencoder overflows in float16
 
     def __post_init__(self) -> None:
-        self.source  # noqa: B018  (checks path, ids, revision and variant)
         if self.size is not None:
             unit = 2 * FACTOR
             is_possible = self.size > 0 and self.size % unit == 0

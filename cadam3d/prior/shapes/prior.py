@@ -142,7 +142,7 @@ class ShapesPrior(DiffusionPrior):
 
     def mixture(self, scene: Scene, cameras: Cameras, background: Float[Tensor, "v 3"]) -> Mixture:
         """Return the distribution of images of a scene for each view."""
-        layers, scene = self._layers(scene, cameras)
+        layers, scene = _traced(scene, cameras, self.samples_per_pixel, self.tracer)
         edge = 4 * layers.alpha * (1 - layers.alpha)
         sigma = (self.spread + self.edge_spread * edge)[:, None].expand(-1, 3, -1, -1)
         return Mixture(
@@ -182,10 +182,6 @@ class ShapesPrior(DiffusionPrior):
         """
         return replace(true_scene(build(prompt), self.samples_per_pixel, tracer=self.tracer), alpha=None)
 
-    def _layers(self, scene: Scene, cameras: Cameras) -> tuple[Layers, Scene]:
-        scene = scene.to(cameras.intrinsics.device, cameras.intrinsics.dtype)
-        return shared_trace(scene, cameras, self.samples_per_pixel, self.tracer), scene
-
     def _guess(self, noisy: Tensor, t: Tensor, mixture: Mixture, branch: int) -> tuple[Tensor, Tensor]:
         a, b = self.noise_path.a(t), self.noise_path.b(t)
         clean, noise = mixture.denoise(noisy, a, b)
@@ -201,22 +197,24 @@ class ShapesPrior(DiffusionPrior):
 def true_scene(scene: Scene, samples_per_pixel: int, turns: int | None = None, tracer: str = "auto") -> Truth:
     """Return the images, the outlines and the shape of a scene, whose modes differ in colour only."""
 
-    def layers(cameras: Cameras) -> tuple[Layers, Scene]:
-        sized = scene.to(cameras.intrinsics.device, cameras.intrinsics.dtype)
-        return shared_trace(sized, cameras, samples_per_pixel, tracer), sized
-
     def images(cameras: Cameras, background: Tensor) -> Tensor:
-        traced, sized = layers(cameras)
+        traced, sized = _traced(scene, cameras, samples_per_pixel, tracer)
         return traced.images(sized.albedo, background).permute(1, 0, 3, 4, 2)
 
     def alpha(cameras: Cameras) -> Tensor:
-        traced, sized = layers(cameras)
+        traced, sized = _traced(scene, cameras, samples_per_pixel, tracer)
         return traced.alpha.expand(len(sized.albedo), *traced.alpha.shape)
 
     def distance(points: Tensor) -> Tensor:
         return signed_distance(scene.to(points.device, points.dtype), points)[None]
 
     return Truth(images=images, distance=distance, alpha=alpha, turns=turns)
+
+
+def _traced(scene: Scene, cameras: Cameras, samples: int, tracer: str) -> tuple[Layers, Scene]:
+    """Return the rendered scene, and the scene on the device and in the dtype of the cameras."""
+    scene = scene.to(cameras.intrinsics.device, cameras.intrinsics.dtype)
+    return shared_trace(scene, cameras, samples, tracer), scene
 
 
 def error_field(image: Float[Tensor, "v c h w"], seed: int) -> Float[Tensor, "v c h w"]:
