@@ -26,12 +26,6 @@ def test_lines_are_read_in_the_order_in_which_they_were_written(tmp_path):
     assert len((tmp_path / "deep" / "metrics.jsonl").read_text().splitlines()) == 5
 
 
-def test_every_line_is_on_disk_before_the_next_one_is_written(tmp_path):
-    for count in range(1, 4):
-        append_jsonl(tmp_path / "m.jsonl", {"step": count})
-        assert len(read_jsonl(tmp_path / "m.jsonl")) == count
-
-
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_values_that_json_lacks_become_null(tmp_path, value):
     append_jsonl(tmp_path / "m.jsonl", {"loss": value, "deep": {"list": [value, 1.0]}})

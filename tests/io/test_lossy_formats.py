@@ -17,7 +17,6 @@ from formats import (
     random_gaussians,
 )
 
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.compressed_ply import read_compressed_ply, write_compressed_ply
 from cadam3d.io.frames import file_to_world
@@ -94,10 +93,3 @@ def test_few_gaussians_are_a_valid_file(tmp_path, name, n):
     each.write(tmp_path / "a", random_gaussians(n, each.degree), up="+y")
     back = each.read(tmp_path / "a", up="+y")
     assert (len(back), back.sh_degree) == (n, each.degree)
-
-
-@pytest.mark.parametrize("name", OWN)
-def test_what_is_not_a_file_is_one_message(tmp_path, name):
-    for path in (tmp_path, tmp_path / "absent", tmp_path / "null\0byte"):
-        with pytest.raises(UserError, match=r"Try: another file$"):
-            OWN[name].read(path)
