@@ -61,7 +61,7 @@ class Pick:
 
 @dataclass(frozen=True)
 class AnswerFile:
-    """What a rater has saved."""
+    """The answers that a rater has saved."""
 
     kind: Literal["study answers"]
     version: Literal[1]

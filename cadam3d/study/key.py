@@ -23,7 +23,7 @@ LARGEST_KEY = 1 << 24  # bytes
 
 @dataclass(frozen=True, kw_only=True)
 class KeyClip:
-    """What a clip shows."""
+    """The facts about what a clip shows."""
 
     arm: str  # of a ruined clip, that of its run
     prompt: str
