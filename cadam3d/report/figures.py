@@ -201,7 +201,7 @@ def _draw_heat(axes: Axes, points: Sequence[FrontierPoint], quality: Number) -> 
             weight="bold" if point.is_standard else "normal",
             color="#111111",
         )
-    axes.imshow(table, cmap="summer", origin="lower", aspect="auto", alpha=0.6)
+    axes.imshow(table, cmap="summer", origin="lower", aspect="auto")
     axes.set_xticks(range(len(across)), [f"{each:g}" for each in across])
     axes.set_yticks(range(len(down)), [f"{each:g}" for each in down])
     axes.set_xlabel(names[0][0])

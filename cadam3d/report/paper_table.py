@@ -59,7 +59,7 @@ def paper_table(results: Sequence[JobResult]) -> PaperTable | None:
     for category in filter(None, dict.fromkeys(result.category for result in results)):
         own = _rows([result for result in results if result.category == category], numbers)
         rows += [replace(row, category=category) for row in own]
-    notes = _notes(results, usable, numbers)
+    notes = _notes(usable, numbers)
     if published:
         notes.append(
             "Rows marked published are printed in the paper's table 1. They belong to another protocol. "
@@ -208,7 +208,7 @@ def _prompts(found: Iterable[Cell], planned: Iterable[JobResult]) -> str:
     return f"{done}" if done == all_ else f"{done} of {all_}"
 
 
-def _notes(results: Sequence[JobResult], usable: Sequence[JobResult], numbers: Sequence[Number]) -> list[str]:
+def _notes(usable: Sequence[JobResult], numbers: Sequence[Number]) -> list[str]:
     notes = [
         "Means over prompts, of which each is a mean over its seeds; after ±, half the width of the 95 % "
         "interval over prompts (Student's t).",
@@ -220,5 +220,5 @@ def _notes(results: Sequence[JobResult], usable: Sequence[JobResult], numbers: S
     if protocols := {method["protocol.name"] for method in methods if "protocol.name" in method}:
         notes.append(f"Learned scores: protocol={', '.join(protocols)}, as eval.json of each job records it.")
     if early := sum(result.ended_early for result in usable):
-        notes.append(f"{early} of {len(results)} jobs ended early, with unfinished assets.")
+        notes.append(f"{early} of {len(usable)} assets are unfinished, because their jobs ended early.")
     return notes

@@ -157,14 +157,12 @@ def _arm(row: Row, overrides: Mapping[str, Any]) -> str:
 
 def _result(row: Row, overrides: Mapping[str, Any], varied: Sequence[str], axes: Sequence[str]) -> JobResult:
     shipped = _shipped(_densifier(row, overrides))
-    summary = {**row.summary, **read_quality(row.folder, row.summary)}
     # Whether a comparison with a truth comes from training or from eval.json is the same for all tables.
     evaluation = read_evaluation(row.folder, row.summary)
     known = declared(evaluation) | declared(row.summary)
-    evaluation = {
-        name: value for name, value in evaluation.items() if name not in known or not known[name].needs_truth
-    }
-    sources = (summary, evaluation)
+    truths = {name for name, each in known.items() if each.needs_truth}
+    others = {name: value for name, value in evaluation.items() if name not in truths}
+    sources = ({**row.summary, **read_quality(row.folder, row.summary)}, others)
     given = {key.removeprefix(PREFIX): value for key, value in overrides.items() if key.startswith(PREFIX)}
     thresholds = [key.removeprefix(PREFIX) for key in varied if key.startswith(PREFIX)]
     return JobResult(
@@ -173,12 +171,12 @@ def _result(row: Row, overrides: Mapping[str, Any], varied: Sequence[str], axes:
             _arm(row, overrides),
             tuple((key, _threshold(given.get(key, shipped.get(key)))) for key in thresholds),
         ),
-        is_standard=all(_same(shipped.get(key), value) for key, value in given.items()),
+        is_standard=all(_threshold(shipped.get(key)) == _threshold(value) for key, value in given.items()),
         cell=_cell(row, overrides, axes),
         outcome=str(row.outcome),
         message=str(row.summary.get("message") or ""),
-        grows=summary.get("grows") is not False,
-        seconds=number(summary.get("seconds")),
+        grows=row.summary.get("grows") is not False,
+        seconds=number(row.summary.get("seconds")),
         objective=str(overrides.get(GUIDANCE) or row.summary.get(GUIDANCE) or ""),
         category=row.category,
         numbers=_numbers(sources, known),
@@ -205,10 +203,6 @@ def _cell(row: Row, overrides: Mapping[str, Any], axes: Sequence[str]) -> Cell:
 def _threshold(value: object) -> float | str:
     as_number = number(value)
     return str(value) if as_number is None else as_number
-
-
-def _same(one: object, other: object) -> bool:
-    return one == other or (number(one) is not None and number(one) == number(other))
 
 
 def _varied(jobs: Sequence[Mapping[str, Any]]) -> list[str]:

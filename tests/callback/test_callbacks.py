@@ -28,13 +28,6 @@ def test_a_checkpoint_at_the_last_step_is_not_written_twice(train, tmp_path, mon
     assert written == ["step_0000002.pt", "step_0000004.pt"]
 
 
-def test_checkpoints_of_later_steps_are_deleted(train, tmp_path):
-    train(tmp_path, "steps=6", callbacks=[Checkpoint(every=2, keep=9)])
-    train(tmp_path, "steps=5", callbacks=[Checkpoint(every=3, keep=9)])  # another run, from step 0
-    names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
-    assert names == ["step_0000003.pt", "step_0000005.pt"]
-
-
 def test_after_running_out_of_memory_the_last_checkpoint_stays(train, tmp_path, monkeypatch):
     calls = iter(range(100))
 

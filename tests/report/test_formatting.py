@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from cadam3d.report.formatting import elapsed, number, plural, short, show
+from cadam3d.report.formatting import elapsed, number, short, show
 
 
 @pytest.mark.parametrize(
@@ -37,7 +37,3 @@ def test_durations_have_suitable_units(seconds, text):
 @pytest.mark.parametrize("value", [True, None, "3", math.inf, math.nan])
 def test_a_number_is_finite_and_not_a_boolean(value):
     assert number(value) is None
-
-
-def test_one_is_singular():
-    assert [plural(1, "job"), plural(0, "job"), plural(2, "job")] == ["1 job", "0 jobs", "2 jobs"]

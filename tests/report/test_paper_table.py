@@ -162,13 +162,6 @@ def test_published_rows_keep_their_text_and_never_share_a_cell(three):
     assert any("another protocol" in note for note in table.notes)
 
 
-def test_objectives_that_the_paper_lacks_have_no_published_rows(jobs):
-    jobs.add("cadam", "guidance=gcs", n=10, psnr=20, arm="cadam")
-    table = table_of(jobs.folder)
-    assert [row.source for row in table.rows] == ["this sweep"]
-    assert not any("published" in note for note in table.notes)
-
-
 def test_each_category_has_its_own_part(three):
     table = table_of(three)
     assert list(dict.fromkeys(row.category for row in table.rows)) == ["", "Material", "Structure & 100 %"]

@@ -10,7 +10,7 @@ import pytest
 
 from cadam3d import report
 from cadam3d.report.charts import WIDTH
-from cadam3d.report.style import LEAST_TEXT, inline, least_width, styled, svg_of
+from cadam3d.report.style import inline, least_width, styled, svg_of
 from cadam3d.report.sweep_page import KINDS
 
 PHONE = 375  # CSS pixels
@@ -47,11 +47,6 @@ def test_the_text_of_a_figure_is_legible_at_its_least_width(bench_results, name)
     assert least_width(svg) <= width * 4 / 3 + 1
     assert f"--least: {least_width(svg):.0f}px" in inline(svg)
     assert "min-width: var(--least)" in CSS
-
-
-def test_a_drawing_without_text_may_have_any_width():
-    assert least_width('<svg width="100pt" viewBox="0 0 100 50"></svg>') == 0.0
-    assert least_width('<svg width="100pt"><text style="font: 700 8px x"/></svg>') == 100 * LEAST_TEXT / 8
 
 
 def test_the_text_of_a_chart_is_legible_on_a_phone():

@@ -5,9 +5,7 @@ import json
 import pytest
 from declarations import declared
 
-from cadam3d.core.errors import UserError
 from cadam3d.report.results import ArmSetting, at_noise, histograms, levels_of, measured, read
-from cadam3d.sweep.table import as_text, write_table
 
 
 def test_a_threshold_that_varies_within_an_arm_makes_settings(jobs):
@@ -29,11 +27,6 @@ def test_a_job_that_does_not_set_a_swept_threshold_has_the_shipped_value(jobs):
     results = read(jobs.folder)
     assert results[0].setting == ArmSetting("baseline", (("tau_pos", 0.0002),))
     assert [result.is_standard for result in results] == [True, False]
-
-
-def test_a_changed_threshold_is_not_standard_even_if_it_never_varies(jobs):
-    jobs.add("baseline", "densifier.tau_pos=0.001", n=100, psnr=20.0)
-    assert not read(jobs.folder)[0].is_standard
 
 
 def test_a_key_within_a_schedule_has_a_shipped_value_too(jobs):
@@ -68,20 +61,6 @@ def test_a_job_that_may_face_any_side_is_judged_at_its_best_turn(jobs):
     assert not (turned.keys() | more.keys()) & baseline.numbers.keys()
 
 
-def test_the_table_of_a_sweep_has_the_columns_of_a_truth_only_if_a_job_names_one(jobs):
-    jobs.add("cadam", n=100, psnr=12.5)
-    table = jobs.folder / "sweep.csv"
-    write_table(jobs.folder)
-    assert "psnr_turned" not in table.read_text(encoding="utf-8")
-    jobs.add("cadam", "seed=1", n=100, psnr=12.5, psnr_turned=15.5, iou=0.8)
-    rows = write_table(jobs.folder)
-    header, before, turned = table.read_text(encoding="utf-8").splitlines()
-    assert header.endswith("message,psnr_turned,iou,folder")
-    assert ",15.5,0.8," in turned
-    assert ",,," in before
-    assert [line.split()[-2] for line in as_text(rows).splitlines()] == ["psnr", "12.5", "15.5"]
-
-
 def test_a_job_without_a_psnr_has_that_of_its_evaluation(jobs):
     """An evaluation of another asset, and one that cannot be read, do not count."""
     for count, psnr in ((100, None), (100, 20.0), (99, None)):
@@ -93,12 +72,6 @@ def test_a_job_without_a_psnr_has_that_of_its_evaluation(jobs):
     results = read(jobs.folder)
     assert [result.numbers.get("psnr") for result in results] == [15.0, 20.0, None, None]
     assert not any("iou" in result.numbers for result in results)
-
-
-def test_thresholds_may_be_words(jobs):
-    for views in ("sum_norm", "last"):
-        jobs.add("baseline", f"densifier.views={views}", n=100, psnr=20.0)
-    assert [result.setting.values for result in read(jobs.folder)] == ["sum_norm", "last"]
 
 
 @pytest.mark.parametrize(
@@ -154,12 +127,6 @@ def test_a_job_without_a_summary_is_unfinished(jobs):
     assert measured(results) == []
 
 
-def test_jobs_keep_the_order_of_the_plan(jobs):
-    for seed in range(12):
-        jobs.add("cadam", f"seed={seed}", n=100, psnr=20.0)
-    assert [result.cell["seed"] for result in read(jobs.folder)] == [str(seed) for seed in range(12)]
-
-
 def test_a_prompt_with_commas_and_quotes_is_read_back_unchanged(jobs):
     jobs.add("cadam", r"prompt='a red, \'old\' cube=1'", n=100, psnr=20.0)
     assert read(jobs.folder)[0].cell["prompt"] == "a red, 'old' cube=1"
@@ -178,8 +145,3 @@ def test_noise_levels_are_in_the_order_of_the_sweep(jobs):
     results = read(jobs.folder)
     assert levels_of(results) == ["strong", "none", "weak"]
     assert len(at_noise(results, "weak")) == 1
-
-
-def test_a_folder_that_is_not_a_sweep_is_refused(tmp_path):
-    with pytest.raises(UserError, match=r"jobs\.json"):
-        read(tmp_path)

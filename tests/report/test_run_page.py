@@ -165,12 +165,6 @@ def test_a_large_video_is_linked_not_embedded(tmp_path, monkeypatch):
     assert make(tmp_path).sources()[0].startswith("data:video/mp4")
 
 
-def test_only_files_that_exist_are_linked(tmp_path):
-    (tmp_path / "asset.ply").write_bytes(b"ply")
-    page = make(tmp_path)
-    assert [value for tag, name, value in page.attributes if (tag, name) == ("a", "href")] == ["asset.ply"]
-
-
 @pytest.mark.parametrize(
     "summary",
     [{}, {"prompt": None}, {"num_gaussians": None, "psnr": float("nan"), "seconds": 0.0, "steps": 0}],
@@ -221,20 +215,6 @@ def test_a_declared_chart_of_the_objective_is_drawn_from_its_log(tmp_path):
     assert "<h2>Densifier</h2>" not in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_a_declared_chart_without_numbers_does_not_change_the_page(tmp_path):
-    metrics = [step(1), refine(2), step(3)]
-    make(tmp_path, metrics=metrics)
-    without = (tmp_path / "report.html").read_bytes()
-    make(tmp_path, metrics=metrics, charts=[WOBBLE, HEAT])
-    assert (tmp_path / "report.html").read_bytes() == without
-
-
-def test_a_declared_share_is_shown_in_percent(tmp_path):
-    chart = Chart(title="Share", caption="", curves=(Curve(key="share"),), percent=True)
-    page = make(tmp_path, metrics=[refine(100, share=0.25), refine(150, share=0.5)], charts=[chart])
-    assert "40%" in page.text
-
-
 @pytest.mark.parametrize("densifier", ["cadam", "baseline"])
 def test_the_reports_know_no_statistic_and_no_score_by_name(densifier):
     made = component(compose([f"densifier={densifier}", "prompt=any"]).densifier)
@@ -279,22 +259,11 @@ def test_the_colour_of_the_outcome_follows_its_severity(tmp_path, outcome, mood)
     assert outcome.replace("_", " ") in page.text
 
 
-def test_warnings_are_shown(tmp_path):
-    assert "ffmpeg is missing" in make(tmp_path, {**SUMMARY, "warnings": ["ffmpeg is missing"]}).text
-
-
 @pytest.mark.parametrize("style", [css(), (TEMPLATES / "page.css").read_text(encoding="utf-8")])
 def test_light_and_dark_define_the_same_colours(style):
     light, dark = style.split("@media (prefers-color-scheme: dark)")
     light, dark = light[light.index(":root") :], dark[: dark.index("}")]
     assert set(re.findall(r"(--[\w-]+):", light)) == set(re.findall(r"(--[\w-]+):", dark)) != set()
-
-
-def test_every_colour_that_a_page_uses_is_defined(tmp_path):
-    make(tmp_path, metrics=[step(1), refine(2), refine(4, reset=7)])
-    html = (tmp_path / "report.html").read_text(encoding="utf-8")
-    defined = set(re.findall(r"(--[\w-]+):", html))
-    assert set(re.findall(r"var\((--[\w-]+)", html)) <= defined
 
 
 def test_a_page_stays_small_and_its_identifiers_differ(tmp_path):

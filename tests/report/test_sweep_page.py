@@ -1,6 +1,5 @@
 """The page of a sweep is self-contained, names what failed, and is safe against whatever a user typed."""
 
-import csv
 import html
 import json
 import re
@@ -9,7 +8,7 @@ import pytest
 
 from cadam3d import report
 from cadam3d.core.errors import UserError
-from cadam3d.report import sweep_page, tables
+from cadam3d.report import tables
 from cadam3d.report.pages import table
 from cadam3d.report.results import read
 
@@ -41,17 +40,6 @@ def test_the_line_of_the_sweep_comes_before_those_of_its_jobs(jobs):
     jobs.add("cadam", "prompt=a cube", n=100, psnr=20.0)
     text = html.unescape(report.write_sweep(jobs.folder).read_text(encoding="utf-8"))
     assert "cadam3d sweep grid=mine 'prompt=a cube'\ncadam3d train densifier=cadam 'prompt=a cube'" in text
-
-
-def test_figures_and_tables_are_files_too(whole, bench):
-    names = {path.name for path in (bench / "figures").iterdir()}
-    drawn = {"frontier", "growth", "shake", "masks", "thresholds", "assets"}
-    assert {f"{name}.{kind}" for name in drawn for kind in ("svg", "png")} <= names
-    assert {"medians.csv", "comparison.csv"} <= names
-    with (bench / "figures/medians.csv").open(newline="") as file:
-        lines = list(csv.DictReader(file))
-    assert len(lines) == 3 * 8
-    assert {line["noise"] for line in lines} == {"none", "medium", "strong"}
 
 
 def test_the_page_fetches_nothing_and_runs_nothing(whole):
@@ -100,13 +88,6 @@ def heading(folder) -> str:
     assert found is not None
     assert f"<title>{found.group(1)} - cadam3d</title>" in page
     return html.unescape(found.group(1))
-
-
-def test_the_title_of_a_grid_is_its_name_with_the_prompts(jobs):
-    jobs.line = ["steps=60", "grid='thresholds'", "prompt=a red torus"]
-    for tau in (0.1, 0.2):
-        jobs.add("cadam", "prompt=a red torus", f"densifier.tau_Q={tau}", n=100, psnr=20.0)
-    assert heading(jobs.folder) == "thresholds: a red torus"
 
 
 def test_the_title_of_a_list_names_some_prompts(jobs):
@@ -180,12 +161,6 @@ def test_the_frontier_of_any_number_can_be_requested(jobs):
     )
 
 
-def test_a_figure_can_be_requested_by_name(jobs):
-    jobs.files(jobs.add("cadam", n=100, psnr=20.0), 100)
-    sweep_page.write(jobs.folder, ["growth"])
-    assert [path.stem for path in (jobs.folder / "figures").glob("*.svg")] == ["growth"]
-
-
 # Tables.
 
 
@@ -235,16 +210,6 @@ def test_numbers_of_a_metric_from_elsewhere_are_in_the_tables(jobs):
     assert [line["shine (lx)"] for line in tables.jobs_table(results)] == [2.0, 3.5]
 
 
-def test_every_setting_is_in_the_table_of_medians(jobs):
-    jobs.add("cadam", n=100, psnr=20.0)
-    for growth in (0.1, 0.2):
-        jobs.add("mcmc", f"densifier.growth={growth}", n=100, psnr=20.0)
-    results = read(jobs.folder)
-    assert [line["setting"] for line in tables.medians_table(results)] == [
-        *("cadam", "mcmc (growth 0.1)", "mcmc (growth 0.2)")
-    ]
-
-
 def test_the_medians_have_a_line_per_objective_level_and_arm(jobs):
     for guidance in ("sds", "ism"):
         for arm, n in (("none", 10), ("cadam", 100)):
@@ -261,8 +226,3 @@ def test_the_medians_have_a_line_per_objective_level_and_arm(jobs):
 def test_numbers_of_a_column_have_the_same_decimals():
     content = table([{"PSNR": 20.9, "n": 12345}, {"PSNR": 21.25, "n": 1}], align_decimals=True)
     assert content.lines == [["20.90", "12,345"], ["21.25", "1"]]
-
-
-def test_text_is_aligned_to_the_left_and_estimates_like_numbers():
-    content = table([{"arm": "cadam", "fewer": "-94.2 [-95, -93]"}, {"arm": "none", "fewer": None}])
-    assert content.is_text == [True, False]
