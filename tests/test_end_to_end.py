@@ -219,7 +219,7 @@ def test_a_sweep_continues_after_a_killed_job_and_the_same_line_completes_it(fin
     assert all(float(row["psnr"]) > 5 and int(row["num_gaussians"]) > 0 for row in rows_of(table))
 
     _, err = type_in(tmp_path, "sweep", *words, "views=2", code=1)
-    assert err.startswith("cadam3d: views: was 1 in table/")
+    assert err.startswith("cadam3d: views: expected 1 as in table/")
     assert err.endswith("Try: hydra.sweep.dir=table-2\n")
     assert not (tmp_path / "outputs").exists()  # outputs/latest is for single runs
 

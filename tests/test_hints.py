@@ -64,7 +64,7 @@ LINES = [
     ((*TRAIN, "--cfg", "job", "--info", "config"), "cannot be combined"),
     (SWEEP, "sweep: nothing to sweep over"),
     ((*SWEEP, "sed=0,1"), "seed"),
-    ((*SWEEP, "seed=0,1", "hydra.run.dir=x"), "hydra.run.dir: not for sweeps"),
+    ((*SWEEP, "seed=0,1", "hydra.run.dir=x"), "hydra.run.dir: expected hydra.sweep.dir"),
     (("render",), "run, ply: expected one of them"),
     (("render", "ply=nowhere.ply"), "nowhere.ply"),
     (("export", "run=[a,b]"), "run: expected one run"),

@@ -199,8 +199,6 @@ def require_measured(
     if choice is not None and not choice.without:
         return
     example = f"'metric=[{','.join([*chosen, metrics[0]])}]'"
-    if all(attempt.measured for attempt in attempts):
-        example = measuring_line(folder, known[names[0]])
     expected = f"metrics that measure {' or '.join(names)}"
     raise fail("select", expected=expected, got=", ".join(chosen) or "none", example=example)
 

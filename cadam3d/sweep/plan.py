@@ -16,7 +16,7 @@ from omegaconf.errors import InterpolationResolutionError
 from cadam3d.core.checks import fail, require, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import RUN_FOLDER, typed_path
-from cadam3d.settings.advice import RefusedJobError, line_of
+from cadam3d.settings.advice import RefusedJobError
 from cadam3d.settings.check import require_effective, require_settings
 from cadam3d.settings.compose import compose_line, flatten
 from cadam3d.settings.line import DRY_RUN, LAUNCHER_KEY, SWEEP_FOLDER, key_of
@@ -200,7 +200,7 @@ def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> Sw
     node = cfg.get("grid")
     grid = read_grid(None if node is None else OmegaConf.to_container(node, resolve=True))
     axes = read_line(parts.jobs)
-    prompts = _read_prompts(cfg, grid, axes, overrides)
+    prompts = _read_prompts(cfg, grid, axes)
     if prompts is not None:
         axes = {"prompt": prompt_axis(prompts.read())} | axes
     composer = Composer(options, search_path(overrides))
@@ -247,7 +247,7 @@ def folder_of(cfg: DictConfig, parts: Parts, usual: Path) -> Path:
     return typed_path(str(text))
 
 
-def _read_prompts(cfg: DictConfig, grid: Grid, axes: Axes, overrides: Sequence[str]) -> PromptChoice | None:
+def _read_prompts(cfg: DictConfig, grid: Grid, axes: Axes) -> PromptChoice | None:
     """Return the choice of prompts of a line or its grid. A prompt in the line replaces those of the grid.
 
     Raises ``UserError`` if the line has both a prompt and a choice of prompts.
@@ -258,8 +258,7 @@ def _read_prompts(cfg: DictConfig, grid: Grid, axes: Axes, overrides: Sequence[s
     if "prompt" not in axes:
         return read_choice(choice, grid.prompts)
     if read_choice(choice, None) is not None:
-        kept = line_of("sweep", [override for override in overrides if key_of(override) != "prompt"])
-        raise UserError(f"{KEY}: expected either {KEY}= or prompt=, got both. Try: {kept}")
+        raise fail(KEY, expected=f"either {KEY}= or prompt=", got="both", example=f"{KEY}=paper50")
     return None
 
 
@@ -269,8 +268,7 @@ def sort_overrides(overrides: Sequence[str]) -> Parts:
     for override in overrides:
         key = key_of(override)
         if REFUSED_KEY.match(key):
-            example = f"cadam3d sweep {SWEEP_FOLDER}=multirun/mine"
-            raise UserError(f"{key}: not for sweeps; their jobs share one folder. Try: {example}")
+            raise fail(key, expected=SWEEP_FOLDER, got=key, example=f"{SWEEP_FOLDER}=multirun/mine")
         if key == "hydra.mode":
             continue
         if key == KEY and "=" in override:

@@ -60,9 +60,8 @@ def read_choice(node: Mapping[Any, Any] | None, default: str | None = None) -> P
     given = {key: value for key, value in (node or {}).items() if value is not None}
     source, category, first = given.get("file", default), given.get("category"), given.get("first")
     if source is None:
-        for name, value in given.items():
-            example = f"{KEY}={set_names()[0]} {KEY}.{name}={value}"
-            raise fail(f"{KEY}.{name}", expected=f"{KEY}=FILE too", got=value, example=example)
+        if given:
+            raise fail(KEY, expected="a file or a set", got=given, example=f"{KEY}={set_names()[0]}")
         return None
     expected = f"a file, or one of the sets {'|'.join(set_names())}"
     require(_is_text(source), KEY, expected=expected, got=source, example=f"{KEY}={set_names()[0]}")

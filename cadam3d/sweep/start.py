@@ -18,6 +18,7 @@ from types import FrameType
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
+from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.io.lock import locked
 from cadam3d.io.occupied import in_use
@@ -148,11 +149,8 @@ def _refuse_other_settings(rows: Sequence[Row], composed: Sequence[Composed], fo
         before = dict(flatten(read_config(config)))
         for name in sorted((before.keys() | now.values.keys()) - now.unknown - {*NOT_OF_A_RUN}):
             if before.get(name) != now.values.get(name):
-                raise UserError(
-                    f"{name}: was {before.get(name)} in {shown(row.folder)}, is {now.values.get(name)} now. "
-                    "The earlier settings or another folder are possible. "
-                    f"Try: {_beside(folder, key)}"
-                )
+                expected = f"{before.get(name)!r} as in {shown(row.folder)}"
+                raise fail(name, expected=expected, got=now.values.get(name), example=_beside(folder, key))
 
 
 def _title(sweep: Sweep, rows: Sequence[Row]) -> str:

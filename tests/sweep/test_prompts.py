@@ -91,7 +91,7 @@ def test_a_category_and_a_number_choose_a_part(tmp_path):
         ({"category": ""}, "prompts.category: expected a category"),
         ({"file": ""}, "prompts: expected a file, or one of the sets"),
         ({"file": 7}, "prompts: expected a file, or one of the sets"),
-        ({"file": None, "shard": "1/2"}, "prompts.shard: expected prompts=FILE too, got '1/2'"),
+        ({"file": None, "shard": "1/2"}, "prompts: expected a file or a set, got {'shard': '1/2'}"),
     ],
 )
 def test_wrong_parts_are_refused(node, expected):

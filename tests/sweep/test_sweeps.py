@@ -276,11 +276,8 @@ def test_other_settings_in_the_same_folder_are_refused_with_the_key(sweep, calls
     assert sweep("prompt=a cube", "grid=densifiers").code == 0
     result = sweep("prompt=a cube", "grid=densifiers", "steps=9")
     assert result.code == 1
-    assert result.err.startswith(f"cadam3d: optimizer.steps: was 5 in {folder}/baseline_a-cube_")
-    assert result.err.endswith(
-        ", is 9 now. The earlier settings or another folder are possible. "
-        "Try: hydra.sweep.dir=multirun/densifiers-2\n"
-    )
+    assert result.err.startswith(f"cadam3d: optimizer.steps: expected 5 as in {folder}/baseline_a-cube_")
+    assert result.err.endswith(", got 9. Try: hydra.sweep.dir=multirun/densifiers-2\n")
     assert (folder / "sweep.csv").read_bytes() == table
     assert not Path("multirun/densifiers-2").exists()
     assert len(calls(folder)) == 3
@@ -389,7 +386,7 @@ def test_shards_merge_into_the_whole_sweep_by_copying_their_folders(sweep):
         (
             ("prompts=shapes6", "prompt=a cube"),
             "sweep",
-            "prompts: expected either prompts= or prompt=, got both. Try: cadam3d sweep prompts=shapes6",
+            "prompts: expected either prompts= or prompt=, got 'both'.",
         ),
         (("prompts=shapes6", "prompts.shards=1/2"), "sweep", "prompts.shard"),
         (("prompts=shapes6", "negative_prompts=x"), "sweep", "Did you mean negative_prompt?"),
@@ -580,9 +577,9 @@ def test_after_a_failure_of_the_launcher_the_table_is_right(sweep, monkeypatch):
         ),
         (
             ("seed=0,1", "hydra.run.dir=x"),
-            "hydra.run.dir: not for sweeps",
+            "hydra.run.dir: expected hydra.sweep.dir",
         ),
-        (("seed=0,1", "hydra/sweeper=optuna"), "hydra/sweeper: not for sweeps"),
+        (("seed=0,1", "hydra/sweeper=optuna"), "hydra/sweeper: expected hydra.sweep.dir"),
         (("seed=0,1", "hydra.sweep.dir="), "hydra.sweep.dir: expected a folder"),
         (("seed=0,1", "hydra.sweep.dir=x_${seedd}"), "hydra.sweep.dir: Interpolation key 'seedd' not found"),
         (("seed=interval(0,1)",), "expected values one by one"),
