@@ -206,7 +206,7 @@ def test_a_sweep_continues_after_a_killed_job_and_the_same_line_completes_it(fin
     os.kill(int(child), signal.SIGKILL)
     _, err = process.communicate(timeout=SECONDS)
     assert process.returncode == 1
-    assert f"1 of 2 jobs has no result (1 killed); see table/{jobs[0].name}/console.txt." in err
+    assert f"1 of 2 jobs without a result (1 killed); see table/{jobs[0].name}/console.txt." in err
     assert [row["outcome"] for row in rows_of(table)] == ["killed", "finished"]
     untouched = (jobs[1] / "summary.json").stat().st_mtime_ns
 
@@ -260,9 +260,9 @@ def test_four_attempts_survive_a_kill_in_the_middle_and_the_best_is_linked(tmp_p
     assert len(set(psnr)) == 4  # four different assets
     best = psnr.index(max(psnr))
     assert (folder / "best").readlink() == Path(f"seed={best}")
-    assert f"is seed={best} with {psnr[best]:.2f} dB" in out
+    assert f"by PSNR: seed={best}. " in out
     assert (tmp_path / "outputs" / "latest" / "best" / "asset.ply").is_file()
-    assert f"is seed={best} with" in (folder / "report.html").read_text()
+    assert f"seed={best}. " in (folder / "report.html").read_text()
 
 
 def rows_of(sweep: Path) -> list[dict[str, str]]:
