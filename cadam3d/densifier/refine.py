@@ -88,16 +88,14 @@ class Refine:
         require(
             self.min_opacity < self.reset_value or self.prune_grace > 0,
             "refine.min_opacity",
-            expected=f"a number below refine.reset_value={self.reset_value:g}, or refine.prune_grace > 0, "
-            "because otherwise the next refinement deletes every Gaussian that a reset has lowered",
+            expected=f"a number below refine.reset_value={self.reset_value:g}, or refine.prune_grace > 0",
             got=self.min_opacity,
             example=f"refine.min_opacity={self.reset_value / 2:g}",
         )
         require(
             self.prune_grace < self.reset_interval,
             "refine.prune_grace",
-            expected=f"less than refine.reset_interval={self.reset_interval}, because otherwise "
-            "opacity never prunes after the first reset",
+            expected=f"less than refine.reset_interval={self.reset_interval}",
             got=self.prune_grace,
             example=f"refine.prune_grace={self.reset_interval // 2}",
         )
