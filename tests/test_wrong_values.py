@@ -211,10 +211,10 @@ WRONG_LINES = {
     "+camera.foo.bar=1": "camera: there is no key foo",
     "+callback.foo.bar=1": "callback.foo: is not chosen",
     "callback.progress.refresh_seconds=abc": "callback.progress.refresh_seconds: expected a finite number",
-    "camera.size=10000000": "camera.size: expected at most",
-    "views=100000000000": "views: expected at most",
-    "initializer.count=1000000000000": "initializer.count: expected at most",
-    "exporter.turntable.size=10000000": "exporter.turntable.size: expected at most",
+    "camera.size=10000000": "camera.size: expected a whole number",
+    "views=100000000000": "views: expected a number",
+    "initializer.count=1000000000000": "initializer.count: expected a whole number",
+    "exporter.turntable.size=10000000": "exporter.turntable.size: expected a whole number",
     "metric.fidelity.views=1000000000000": "metric.fidelity.views: expected a whole number >= 1 and <=",
 }
 
