@@ -48,18 +48,18 @@ def run(place) -> Path:
     program.parent.mkdir()
     program.write_text(PROGRAM, encoding="utf-8")
     program.chmod(0o755)
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    environment |= {"PATH": f"{program.parent}{os.pathsep}{os.environ['PATH']}", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        ["bash", "-c", f"{COMMAND} {SMALL}"],
-        cwd=place,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    run_line(place, f"{COMMAND} {SMALL}")
     return place / "outputs" / "latest"
+
+
+def run_line(place: Path, line: str) -> str:
+    """Run a line in a shell that finds the program, and return what it prints."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    environment |= {"PATH": f"{place / 'bin'}{os.pathsep}{os.environ['PATH']}", "OMP_NUM_THREADS": "1"}
+    command = ["bash", "-c", line]
+    done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 @pytest.fixture
@@ -152,3 +152,20 @@ def test_the_new_parts_are_in_the_help_and_found_by_their_declarations(place, mo
     assert "exporter=[xyz]" in exporting(["output=mine.xyz"], folders)
     for name in [name for name in sys.modules if name.partition(".")[0] == "mypackage"]:
         del sys.modules[name]
+
+
+@pytest.mark.slow
+def test_a_sweep_and_a_choice_use_the_metric(place, run):
+    # ``run`` has written the program.
+    flags = f"--config-dir myconfigs {SMALL} metric=[outliers]"
+    lines = [
+        f"sweep prompt='a red torus' seed=0,1 hydra.sweep.dir=both {flags}",
+        "eval run=both 'metric=[outliers]' --config-dir myconfigs",
+        f"train prompt='a red torus' attempts=2 select=outliers {flags}",
+    ]
+    _, table, choice = (run_line(place, f"PYTHONPATH=. cadam3d {line}") for line in lines)
+    header = (place / "both/sweep.csv").read_text(encoding="utf-8").splitlines()[0]
+    assert "outliers" in header.split(",")
+    assert "outliers" in (place / "both/report.html").read_text(encoding="utf-8")
+    assert "outliers" in table
+    assert "by share of outliers: seed=" in choice

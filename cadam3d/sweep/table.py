@@ -139,9 +139,9 @@ def _write(path: Path, rows: Sequence[Row]) -> None:
 
 
 def _comparisons(rows: Sequence[Row]) -> list[str]:
-    """Return the numbers that compare an asset with the truth, without those in ``FACTS``."""
+    """Return the numbers of the assets that metrics declare and that have a better direction."""
     known = {name: number for row in rows for name, number in declared(row.summary).items()}
-    return [name for name, number in known.items() if number.needs_truth and name not in FACTS]
+    return [name for name, number in known.items() if number.is_more_better is not None and name not in FACTS]
 
 
 def _swept_keys(rows: Sequence[Row]) -> list[str]:
