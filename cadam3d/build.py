@@ -46,7 +46,7 @@ def build_trainer(
     """Build the components that ``cfg`` names, and move the prior to ``device``.
 
     The objects in ``given``, by the name of their group, replace components of ``cfg``, which are then not
-    built. ``callbacks`` are called after those of ``cfg``. Raises ``UserError`` for wrong settings.
+    built. ``callbacks`` are called after ``cfg``'s own. Raises ``UserError`` for wrong settings.
     """
 
     def part(name: str, kind: type) -> Any:

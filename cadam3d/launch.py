@@ -147,7 +147,7 @@ def _show_page(line: Line) -> None:
     elif line.is_sweep and line.options.cfg:
         from cadam3d.sweep.plan import read_sweep
 
-        # The settings of a sweep are those of its first job.
+        # The page of a sweep shows the settings of its first job.
         sweep = read_sweep(line.command, line.overrides, line.options)
         flags = [flag for flag in line.flags if flag not in ("-m", "--multirun")]
         run_hydra("sweep", [*sweep.parts.own, *sweep.jobs[0].overrides, *flags])

@@ -149,7 +149,7 @@ class Trainer:
 
         A densifier that ignores the penalties reads the gradients before these are added. If a penalty
         depends on the images, each pass differentiates the rasterizer, and one pass could not do both: the
-        densifier needs the gradients of one loss, and the optimizer those of another.
+        densifier needs the gradients of one loss, and the optimizer the gradients of another.
         """
         state.optimizer.zero_grad()
         if not (losses.penalties and self.densifier.guidance_only):

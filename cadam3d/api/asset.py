@@ -90,7 +90,7 @@ def load(
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Asset:
-    """3D Gaussians, such as those of a run, with ways to look at them and to pass them on.
+    """3D Gaussians, such as a run's, with ways to look at them and to pass them on.
 
     ``len(asset)`` is the number of Gaussians. ``asset.gaussians`` are the tensors themselves.
     """
@@ -136,10 +136,10 @@ class Asset:
         """Return pictures as bytes from 0 to 255: one for each camera, or a turn around the object.
 
         ``kind`` is ``rgb``, ``depth`` (yellow is near), ``alpha`` or ``normal``. ``background`` is RGB in [0,
-        1], or ``"transparent"``, which gives a fourth channel. The settings after it are those of the turn:
+        1], or ``"transparent"``, which gives a fourth channel. The settings after it describe the turn:
         ``views`` pictures of ``size`` pixels, evenly spaced from the front on, ``elevation_deg`` above the
         horizon at ``distance`` world units with a vertical field of view of ``fov_y_deg``. ``None`` is the
-        value in ``configs/exporter/images.yaml``. The pixels are those of ``cadam3d render`` with the same
+        value in ``configs/exporter/images.yaml``. The pixels equal ``cadam3d render`` with the same
         settings.
 
         Raises ``UserError`` for values out of range.

@@ -113,7 +113,7 @@ def require_free(overrides: tuple[str, ...], taken: Mapping[str, object]) -> Non
 
 
 def plain(value: Any) -> Any:
-    """Return ``value`` with the numbers and arrays of NumPy and torch as those of Python."""
+    """Return ``value`` with numbers and arrays of NumPy and torch as Python's own."""
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     return value.tolist() if isinstance(value, np.ndarray | np.generic | Tensor) else value

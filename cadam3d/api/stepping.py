@@ -66,7 +66,7 @@ class Stepper:
     """A run that the caller steps by hand. It does not change; the state that :meth:`start` returns does.
 
     Nothing is written, and the callbacks, exporters and metrics of the settings are not used. The bytes of
-    the Gaussians after the last step are those of :func:`cadam3d.train` with the same settings.
+    the last Gaussians equal :func:`cadam3d.train`'s with the same settings.
     """
 
     prompt: str
@@ -83,7 +83,7 @@ class Stepper:
         return self.parts.steps
 
     def start(self, seed: int | None = None) -> TrainState:
-        """Return the state before the first step; ``seed`` replaces that of the settings.
+        """Return the state before the first step; ``seed`` replaces the settings' seed.
 
         The prior is loaded and the rasterizer compiled, if they need that.
         """

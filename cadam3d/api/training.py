@@ -98,7 +98,7 @@ def train(
     prompt may contain quotes, commas, braces and line breaks. ``overrides`` are the words of the command
     line, such as ``"steps=300"`` or ``"densifier=baseline"``, without quotes for a shell. ``folder`` is the
     folder of the run, by default a new one in ``outputs``; ``${seed}`` in it is the value of that setting.
-    ``callbacks`` are called after those of the settings. To continue a run, pass ``"resume=FOLDER"`` and
+    ``callbacks`` are called after the settings' own. To continue a run, pass ``"resume=FOLDER"`` and
     ``None`` as the prompt, or call :meth:`Run.resume`.
 
     Raises ``UserError`` for mistakes, with the texts of the command line. After Ctrl-C, or the interrupt of a

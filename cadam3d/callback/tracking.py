@@ -40,7 +40,7 @@ class Tracking(Callback):
         if find_spec(self.package) is None:
             raise UserError(
                 f"callback={self.package}: expected the package {self.package}, got none. "
-                f"Try: pip install 'cadam3d[{self.package}]'"
+                f"Try: pip install '.[{self.package}]'"
             )
         require_whole(f"callback.{self.package}.every", self.every, low=1)
 

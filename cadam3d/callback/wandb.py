@@ -56,7 +56,7 @@ class Wandb(Tracking):
         require_range("callback.wandb.timeout", self.timeout, low=1)
 
     def open(self, context: RunContext, step: int) -> None:
-        """Start a run of wandb, or continue that of the folder: offline, unless a server accepts it."""
+        """Start a run of wandb, or continue the folder's run: offline, unless a server accepts it."""
         # wandb reads this when it is imported. To send reports of its errors, set it to true beforehand.
         os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         self._file = context.folder / WANDB_RUN
@@ -164,7 +164,7 @@ def known_run(path: Path) -> tuple[str, int]:
 
 
 def brings_settings(run: Path) -> bool:
-    """Return whether wandb would read settings from the folder of a run, or from that of its sweep.
+    """Return whether wandb would read settings from the folder of a run, or from its sweep's folder.
 
     wandb reads ``wandb/settings`` in the current folder, and sends the API key to the server that is named
     there. This program never writes that file, so it is of unknown origin.

@@ -125,7 +125,7 @@ def logged_to(path: Path) -> Iterator[None]:
 
 
 class _Onward(logging.Handler):
-    """Passes records on to the handlers of the root, as propagation does, but not those of lower levels."""
+    """Passes records on to the handlers of the root, as propagation does, but no records of lower levels."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Pass one record on."""

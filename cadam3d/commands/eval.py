@@ -51,7 +51,7 @@ def run(cfg: DictConfig, call: Call) -> None:
 def evaluate(cfg: DictConfig, call: Call, folder: Path) -> dict[str, Any]:
     """Return what the metrics of ``cfg`` measure of the run in ``folder``, for its ``eval.json``.
 
-    The rasterizer and the prior are those of the run, and so is the truth unless ``cfg`` names another one.
+    The rasterizer, the prior and the truth come from the run unless ``cfg`` names another one.
     If there are no true images, a note in the file replaces ``psnr`` and ``ssim``. Raises ``UserError`` if
     the run names components that must not be built without ``trust=true``, and for a prompt that the truth
     cannot read.
@@ -97,7 +97,7 @@ def evaluate(cfg: DictConfig, call: Call, folder: Path) -> dict[str, Any]:
 
 
 def _as_text(result: Mapping[str, Any]) -> str:
-    """Return the entries of an ``eval.json``, one line each; those of scores say how they were measured."""
+    """Return the entries of an ``eval.json``, one line each; scores say how they were measured."""
     records = result.get(MEASUREMENTS, {})
     # Metrics that have measured no number say why.
     missing = {name: "-" for name in records if name not in result}

@@ -87,7 +87,7 @@ def recorded(folder: Path, asset: OpenedAsset, outputs: Sequence[Output]) -> lis
 
 
 def set_title(cfg: DictConfig, title: object) -> None:
-    """Make the text ``title`` that of the page, in place, if the line exports a page and sets no title."""
+    """Use the text ``title`` as the page's title, in place, if the line exports a page and sets no title."""
     key = "exporter.html.title"
     if isinstance(title, str) and "html" in cfg.exporter and OmegaConf.select(cfg, key) is None:
         # The text may be a stranger's, and a title has no control characters.

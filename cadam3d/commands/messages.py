@@ -36,7 +36,7 @@ def keeping_others(name: str, warnings: list[str], *, is_only: bool = False) -> 
 
 
 def warn(text: str, warnings: list[str]) -> None:
-    """Print a warning, and add it to those of the run."""
+    """Print a warning, and add it to the run's warnings."""
     warnings.append(text)
     log.info("%s", text)
     say(f"Warning: {text}", logging.WARNING)

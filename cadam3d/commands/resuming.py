@@ -1,4 +1,4 @@
-"""Resuming: the state from which a run starts, which is new or that of a checkpoint."""
+"""Resuming: the state from which a run starts, which is new or comes from a checkpoint."""
 
 import logging
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from cadam3d.trainer import Trainer
 def start_or_resume(
     cfg: DictConfig, trainer: Trainer, initializer: Initializer, device: torch.device, folder: Path
 ) -> TrainState:
-    """Return the state before the first step, or that of a checkpoint if ``resume=`` names a run with one."""
+    """Return the state before the first step, or a checkpoint's state if ``resume=`` names a run with one."""
     if cfg.resume is None:
         return trainer.start(cfg.prompt, initializer, cfg.seed, device)
     named = Path(cfg.resume)
@@ -79,7 +79,7 @@ def read_state(path: Path, trainer: Trainer, device: torch.device) -> TrainState
     except PayloadError as error:
         raise DamagedCheckpointError(path, error) from error
     if checkpoint_step(path) not in (None, state.step):
-        raise DamagedCheckpointError(path, f"step: expected that of its name, got {state.step}")
+        raise DamagedCheckpointError(path, f"step: expected the step in its name, got {state.step}")
     return state
 
 

@@ -43,7 +43,7 @@ def optimise(
 ) -> tuple[Path, dict[str, Any]]:
     """Train, export, measure and report. Return the folder of the run and the content of its summary.
 
-    ``callbacks`` are called after those of ``cfg``. Raises ``UserError`` for wrong settings, before the
+    ``callbacks`` are called after ``cfg``'s own. Raises ``UserError`` for wrong settings, before the
     folder changes.
     """
     device = resolve_device(cfg.device)

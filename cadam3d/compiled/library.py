@@ -131,7 +131,7 @@ def build(
         raise UserError(
             f"{library.names.key}: expected a C++ compiler ($CXX, c++, g++ or clang++) to build the kernels "
             "once, got none. "
-            "Try: pip install 'cadam3d[compiler]'"
+            "Try: pip install '.[compiler]'"
         )
     start = time.perf_counter()
     with build_folder(cache_dir, library.names) as folder:
@@ -222,7 +222,7 @@ def _compile(
 
 def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
     try:
-        # A compiler may write in another encoding than that of this process.
+        # A compiler may write in another encoding than this process.
         return subprocess.run(
             command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT, check=False
         )

@@ -18,7 +18,7 @@ SERIES = {  # the curves of a chart, in order
     "#c2395b": ("series-4", "#f07a97"),
 }
 SERIES_COLORS = tuple(SERIES)
-# The arms of a sweep, in order. The first ones are those of Okabe and Ito or close to them, which people with
+# The arms of a sweep, in order. The first ones are Okabe and Ito's or close to them, which people with
 # any kind of colour vision can tell apart; markers differ too, for print in grey.
 ARMS = {
     **{"#d55e00": "#ff9150", "#0072b2": "#62b3f0", "#009e73": "#3fcfa4", "#cc79a7": "#e5a0c8"},

@@ -8,7 +8,7 @@ from torch import Tensor
 def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
     """Return the matrices of quaternions (w, x, y, z) of any length; a zero quaternion gives the identity.
 
-    The results equal those of ``kornia.geometry.conversions.quaternion_to_rotation_matrix`` to the last bit.
+    The results equal ``kornia.geometry.conversions.quaternion_to_rotation_matrix`` to the last bit.
     Importing kornia would add a fifth of a second to every start.
     """
     length = torch.linalg.vector_norm(quats, dim=-1, keepdim=True)

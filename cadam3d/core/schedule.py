@@ -123,7 +123,7 @@ def require_scheduled(key: str, value: object, **bounds: float) -> None:
 
     A schedule is checked at its first and last step and at its milestones, which are the extremes of ours.
 
-    ``bounds`` are those of :func:`~cadam3d.core.checks.require_range`: ``low``, ``high``, ``below`` and
+    ``bounds`` are the bounds of :func:`~cadam3d.core.checks.require_range`: ``low``, ``high``, ``below`` and
     ``above``.
     """
     is_scheduled = isinstance(value, int | float | Schedule)

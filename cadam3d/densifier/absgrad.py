@@ -16,7 +16,7 @@ class AbsGrad(Baseline):
     The baseline takes the view-space gradient, a sum over pixels in which opposite directions cancel. This
     class takes the sums over pixels of the absolute values, along x and along y separately. A large Gaussian
     over fine detail, whose pixels disagree, then stands out. All else is as in the baseline. Absolute values
-    are larger, and those of noise do not cancel either, so the threshold must be higher.
+    are larger, and the gradients of noise do not cancel either, so the threshold must be higher.
     """
 
     @property

@@ -31,7 +31,7 @@ class GradientSignal:
 
     @classmethod
     def read(cls, gaussians: Gaussians, output: RenderOutput) -> "GradientSignal":
-        """Return the gradients of the last backward pass; another pass would add to those of the images.
+        """Return the gradients of the last backward pass; another pass would add to the images' gradients.
 
         The gradient of the means is a copy, because the optimizer reads it after the densifier.
         """

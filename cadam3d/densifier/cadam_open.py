@@ -134,7 +134,7 @@ class CAdamOpen(CAdam):
     def strengths(self, state: CAdamState) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
         """Return drift and noise, to which ``eps`` is added in the unit that ``eps_mode`` chooses.
 
-        The median is that of the Gaussians that ever had a gradient.
+        The median is over the Gaussians that ever had a gradient.
         """
         if self.eps_mode == "abs":
             return super().strengths(state)

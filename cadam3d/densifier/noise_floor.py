@@ -15,7 +15,7 @@ quite equal; n = 1 / s(beta2, a) is its effective number of steps. Hence
     SNR^2 ~ s(beta1, a) n Beta(3/2, 3 (n - 1)/2).
 
 This is exact if v has an infinite memory. ``tests/densifier/test_noise_floor.py`` shows that it is close for
-any memory at least as long as that of beta2 = beta1^2. For large n it becomes s(beta1, a) chi^2_3 / 3.
+any memory at least as long as with beta2 = beta1^2. For large n it becomes s(beta1, a) chi^2_3 / 3.
 """
 
 import math

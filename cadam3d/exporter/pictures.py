@@ -35,7 +35,7 @@ def captions_of(subjects: Sequence[Subject]) -> list[Caption]:
 
 
 def paper_of(background: Sequence[float] | str) -> Color:
-    """Return the colour behind captions: that of the background, or white beside transparent pictures."""
+    """Return the colour behind captions: the background's, or white beside transparent pictures."""
     if isinstance(background, str):
         return PAPER
     red, green, blue = (round(255 * channel) for channel in background)
@@ -54,7 +54,7 @@ def paint(
     """Return the pictures of each kind in ``KINDS``: three channels, or four with straight alpha.
 
     - rgb: the colours over ``background``, which is black for transparent pictures.
-    - depth: closeness, as in ``io/image.py``, over black; ``distance`` is that of the cameras.
+    - depth: closeness, as in ``io/image.py``, over black; ``distance`` is the cameras' distance.
     - alpha: opacity in grey. It has no transparent parts.
     - normal: (n + 1) / 2 over ``background``, where n is the unit normal in the axes of normal maps: right,
       up, towards the camera.

@@ -27,7 +27,7 @@ class Initializer(ABC):
         """Return initial Gaussians on ``device``; all random numbers come from the CPU ``generator``."""
 
     def begin(self, prompt: str, generator: torch.Generator, device: torch.device) -> Beginning:
-        """Return the result of :meth:`build`, or that of a fallback with a note.
+        """Return the result of :meth:`build`, or a fallback's result with a note.
 
         This implementation has no fallback: errors of :meth:`build` are raised.
         """

@@ -27,7 +27,7 @@ from cadam3d.io.gltf import linear, srgb
 UPS = ("z", "y")
 # Other formats of trimesh may refer to files elsewhere, or run other programs.
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
-# Colours of vertices are linear in these files, and those of textures are sRGB (glTF 2.0, sec. 3.9.2). Other
+# Vertex colours are linear in these files, and textures are sRGB (glTF 2.0, sec. 3.9.2). Other
 # formats have sRGB colours only.
 LINEAR_SUFFIXES = (".glb", ".gltf")
 # Linear colours of vertices, among the attributes of a part.
@@ -135,7 +135,7 @@ def _colors_of(part: trimesh.Trimesh, faces: np.ndarray, barycentric: np.ndarray
     rows = np.asarray(part.faces)[faces]
     light = part.vertex_attributes.get(VERTEX_LIGHT)
     if light is not None:
-        # The colour of the material multiplies that of the vertices.
+        # The material's colour multiplies the vertex colours.
         at_points = (barycentric * light[rows]).sum(axis=1)
         if visual.kind == "texture":
             at_points = at_points * _material_light(visual, rows, barycentric)

@@ -36,7 +36,7 @@ class Ply(FromObject):
     """The Gaussians of a file, or the points of a PLY file; the prompt is not used.
 
     Gaussians (PLY, compressed PLY, .splat or SPZ, any SH degree, written by any program) keep their shapes,
-    colours and opacities. Points (text or binary, such as those of Point-E or a scan) become round Gaussians
+    colours and opacities. Points (text or binary, for example from Point-E or a scan) become round Gaussians
     with their colours.
     """
 

@@ -88,7 +88,7 @@ class ShapE(FromObject):
         require_copies(self.replicate, self.replicate_radius, self.replicate_law)
 
     def begin(self, prompt: str, generator: torch.Generator, device: torch.device) -> Beginning:
-        """Return the Gaussians of Shap-E, or those of ``fallback`` with a note if Shap-E fails.
+        """Return Shap-E's Gaussians, or the Gaussians of ``fallback`` with a note if Shap-E fails.
 
         Raises ``UserError`` if Shap-E fails and there is no fallback.
         """

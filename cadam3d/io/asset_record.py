@@ -90,7 +90,7 @@ def require_own_record(folder: Path) -> None:
 def write_record(
     folder: Path, source: Mapping[str, Any], entries: Sequence[FileEntry], *, run: Path | None
 ) -> Path:
-    """Write asset.json with ``entries`` and those of earlier exports of ``source``, and return its path.
+    """Write asset.json with ``entries`` and earlier exports of ``source``, and return its path.
 
     ``source`` is that entry of the record, and ``run`` the folder of the run that made the asset. Raises
     ``UserError`` if a file cannot be read or written.

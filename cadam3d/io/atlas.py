@@ -26,7 +26,7 @@ AT_ONCE = 1 << 20
 def require_xatlas() -> None:
     """Raise ``UserError`` unless xatlas is installed, which only textures need."""
     if find_spec("xatlas") is None:
-        raise UserError("exporter.mesh.texture: needs xatlas. Try: pip install 'cadam3d[texture]'")
+        raise UserError("exporter.mesh.texture: needs xatlas. Try: pip install '.[texture]'")
 
 
 def paint(surface: Surface, colors: ColorFn, size: int) -> Texture:

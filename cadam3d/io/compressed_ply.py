@@ -17,7 +17,7 @@ three in the order w, x, y, z (10 bits each, from -1/sqrt(2) to 1/sqrt(2)); the 
 | ``sh`` | ``f_rest_0`` ... | optional: higher SH coefficients, channel-major as in a PLY. A byte b means \
 ``8 ((b + 0.5) / 256 - 0.5)``, except that 0 means -4 and 255 means 4 |
 
-The axes are those of a PLY, -y up. A comment line records them for this program.
+The axes are a PLY's, -y up. A comment line records them for this program.
 
 Lost are the order of the rows, the lengths of quaternions, SH coefficients outside of [-4, 4] and scales
 outside of [2e-9, 5e8]. Rounding costs half a step: of a position 1/4094 of the extent of its chunk (1/2046

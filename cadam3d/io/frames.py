@@ -1,4 +1,4 @@
-"""Conversion between the axes of the world and those of files.
+"""Conversion between the axes of the world and the axes of files.
 
 The world is +z up with the front at +x, but viewers of 3DGS files expect -y up. Every choice of axes here is
 a signed permutation that moves the front (+x) to +z of the file, where viewers put their first camera. Two
@@ -6,7 +6,7 @@ facts keep the conversion exact in floating point:
 
 * In positions, and in the degree-1 part of a colour, which is a vector too, numbers only change places and
   signs.
-* The axes of each Gaussian may be renamed together with those of the world. The covariance ``R diag(s^2)
+* The axes of each Gaussian may be renamed together with the world's axes. The covariance ``R diag(s^2)
   R^T`` becomes ``(A R A^T) (A diag(s^2) A^T) (A R A^T)^T``. The quaternion of ``A R A^T`` is the old one with
   its vector part permuted, and ``A diag(s^2) A^T`` permutes the scales. Multiplying quaternions instead would
   round.

@@ -53,9 +53,7 @@ CONVERSION = f"pip install {PACKAGE}, which converts it into a ply"
 def require_gaussforge(key: str) -> None:
     """Raise ``UserError`` unless gaussforge is installed; ``key`` is the setting that needs it."""
     if find_spec(PACKAGE) is None:
-        raise UserError(
-            f"{key}: needs {PACKAGE}, which is not installed. Try: pip install 'cadam3d[formats]'"
-        )
+        raise UserError(f"{key}: needs {PACKAGE}, which is not installed. Try: pip install '.[formats]'")
 
 
 def write_sog(path: Path, gaussians: Gaussians, *, up: str) -> None:

@@ -106,7 +106,7 @@ def closeness(
 ) -> Float[Tensor, "*batch h w 3"]:
     """Return depth as colours: yellow is near, dark is far, and black is background.
 
-    The range is that of the unit ball, in which objects fit, seen from ``distance``. It is the same in every
+    The range covers the unit ball, in which objects fit, seen from ``distance``. It is the same in every
     view, so that colours can be compared between images.
     """
     return colorize((distance + 1.0 - depth) / 2.0) * alpha[..., None]

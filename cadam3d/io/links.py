@@ -1,4 +1,4 @@
-"""Links: a name that leads to a folder beside it, such as that of the newest run."""
+"""Links: a name that leads to a folder beside it, such as the newest run's folder."""
 
 import os
 from pathlib import Path

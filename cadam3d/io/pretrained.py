@@ -209,7 +209,7 @@ def require_extra(key: str) -> None:
     """Raise ``UserError`` unless the libraries for pretrained models are installed."""
     missing = [name for name in EXTRA if find_spec(name) is None]
     if missing:
-        raise UserError(f"{key}: needs {', '.join(missing)}. Try: pip install 'cadam3d[diffusers]'")
+        raise UserError(f"{key}: needs {', '.join(missing)}. Try: pip install '.[diffusers]'")
 
 
 def _module(library: str) -> Any:

@@ -163,7 +163,7 @@ def latest_scores(sources: Iterable[Mapping[str, Any]]) -> dict[str, Score]:
 def difference(name: str, scores: Iterable[Score]) -> str | None:
     """Return a sentence about scores that must not be in one table; None if all have one method.
 
-    ``name`` is that of the number.
+    ``name`` is the number's name.
     """
     methods = [score.method for score in scores]
     for key in dict.fromkeys(key for method in methods for key in method):
@@ -264,7 +264,7 @@ def _are(is_item: Callable[[Any], bool], value: Any) -> bool:
 
 
 # The kinds of the entries of summary.json that other parts calculate with. A summary may have more entries,
-# such as those of a metric from elsewhere.
+# such as numbers of a metric from elsewhere.
 SUMMARY_ENTRIES: dict[str, Callable[[Any], bool]] = {
     "outcome": lambda value: _is_text(value) and value in set(Outcome),
     "warnings": lambda value: _are(_is_text, value),

@@ -73,7 +73,7 @@ class Fidelity(HeldOutSettings, Metric):
     def measure(self, measurand: Measurand) -> Measurement:
         """Return PSNR, SSIM and the mode that they belong to; nothing if there are no true images.
 
-        ``psnr`` (dB) and ``ssim`` are means over the views, ``psnr_min`` (dB) is that of the worst view, and
+        ``psnr`` (dB) and ``ssim`` are means over the views, ``psnr_min`` (dB) is the worst view's PSNR, and
         ``mode`` is the index of the mode. If the asset may face any side, ``psnr_turned`` and ``ssim_turned``
         compare with the object turned by ``turn_deg``, in (-180, 180] degrees, counterclockwise seen from
         above.

@@ -29,7 +29,7 @@ class HeldOutSettings(PictureSettings):
     def cameras(self) -> Cameras:
         """Return the held-out views.
 
-        Their azimuths are half a step off those of a turntable. Each elevation is shifted a little more, so
+        Their azimuths are half a step off a turntable's azimuths. Each elevation is shifted a little more, so
         that no two rings look from the same side.
         """
         step = 360.0 / self.views

@@ -27,7 +27,7 @@ class Hps(ClipMetric):
     """The cosine between a picture and the text, in the space of a CLIP model trained on choices of people.
 
     Wu et al. (2023) trained OpenCLIP's ViT-H/14 on choices of people, and publish a file with its weights
-    under the names of OpenCLIP. The numbers are about 0.2 to 0.3, and those of v2.0 and v2.1 differ. Papers
+    under the names of OpenCLIP. The numbers are about 0.2 to 0.3, and differ between v2.0 and v2.1. Papers
     often print 100 times this number.
     """
 

@@ -28,7 +28,7 @@ CACHE = Path("~/.cache/ImageReward")
 LONGEST = 35  # tokens that the package reads
 FOLDER = "models/ImageReward"
 # The package does not declare everything that it imports, and some of it must be old.
-INSTALL = "pip install 'cadam3d[image_reward]' openai-clip torchvision 'setuptools<70' 'transformers<4.56'"
+INSTALL = "pip install '.[image_reward]' openai-clip torchvision 'setuptools<70' 'transformers<4.56'"
 # The package reads the vocabulary only from the cache of the hub, so it is downloaded there.
 DOWNLOAD = (
     f"hf download THUDM/ImageReward {WEIGHTS} {SETTINGS} --local-dir {FOLDER} && "

@@ -119,7 +119,7 @@ def f_score(
 def _sampled(distance: Callable[[Tensor], Tensor]) -> Float[Tensor, "x y z"]:
     """Return signed distances at the centres of ``TRUE_NODES``^3 cells, exact next to the surface.
 
-    Elsewhere they are those of the centre of a larger cell that the surface does not reach. A distance
+    Elsewhere they belong to the centre of a larger cell that the surface does not reach. A distance
     function is never larger than the distance, so a cell with a larger one at its centre than its radius can
     be left whole.
     """

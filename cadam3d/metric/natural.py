@@ -36,7 +36,7 @@ SHAPES = np.arange(0.2, 10.001, 0.001)
 RATIOS = gamma(2 / SHAPES) ** 2 / (gamma(1 / SHAPES) * gamma(3 / SHAPES))
 # The neighbours with which products are fitted: to the right, below, and on both diagonals. (rows, columns)
 NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
-# The entries of a file of parameters, which are those of basicsr.
+# The entries of a file of parameters, as basicsr names them.
 KEYS = ("mu_pris_param", "cov_pris_param", "gaussian_window")
 
 

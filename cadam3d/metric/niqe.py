@@ -1,4 +1,4 @@
-"""Niqe: how far the statistics of a picture are from those of photographs, without any reference."""
+"""Niqe: how far a picture's statistics are from the statistics of photographs, without any reference."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,7 +34,7 @@ class Niqe(ScoreMetric):
         Number(name="niqe", label="NIQE", digits=3, is_more_better=False),
     )
 
-    parameters: str | None  # a file such as basicsr's niqe_pris_params.npz; None = those of this package
+    parameters: str | None  # a file such as basicsr's niqe_pris_params.npz; None = this package's own
     plain_blocks: str  # "keep" or "drop"
 
     def __post_init__(self) -> None:

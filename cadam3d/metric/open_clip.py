@@ -38,7 +38,7 @@ def clip_model(tensors: Mapping[str, Tensor], config: Mapping[str, Any]) -> Any:
     """Return a ``CLIPModel`` of transformers with weights under the names of OpenCLIP: on the CPU, frozen.
 
     The weights are converted to 32 bits. Raises ``RuntimeError`` if they do not fit the configuration, which
-    is that of transformers.
+    is transformers' own.
     """
     from accelerate import init_empty_weights
     from transformers import CLIPConfig, CLIPModel

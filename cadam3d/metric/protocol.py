@@ -141,7 +141,7 @@ class SphereProtocol(Protocol):
 
     @cached_property
     def cameras(self) -> Cameras:
-        """Return the cameras: all fields of view of the first vertex, then those of the second, and so on."""
+        """Return the cameras: all fields of view of the first vertex, then of the second, and so on."""
         x, y, z = torch.tensor(self._mesh.vertices, dtype=torch.float64).unbind(dim=1)
         azimuth, elevation = torch.rad2deg(torch.atan2(y, x)), torch.rad2deg(torch.asin(z.clamp(-1, 1)))
         fovs = torch.tensor([float(each) for each in (self.fov_y_deg, *self.other_fovs_y_deg)])
@@ -163,7 +163,7 @@ class SphereProtocol(Protocol):
 
     @property
     def is_mean(self) -> bool:
-        """Return False: the number is that of the best vertex."""
+        """Return False: the number belongs to the best vertex."""
         return False
 
     @cached_property

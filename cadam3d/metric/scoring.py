@@ -142,14 +142,14 @@ class ModelMetric(ScoreMetric):
 
     def source(self) -> TransformerSource:
         """Return the place of the model. Raises ``UserError`` if neither metric nor protocol names one."""
-        named = self.protocol.models.get(self.kind)
+        named = self.protocol.models.get(self.kind) or {}
         key = f"{self.node}.model"
         if self.model is not None:
             return TransformerSource(key, self.model, self.revision)
-        if named is None:
+        if (model := named.get("id")) is None:
             raise UserError(f"{key}: protocol={self.protocol.name} names no model for this metric")
-        revision = named["revision"] if self.revision is None else self.revision
-        return TransformerSource(key, named["id"], revision)
+        revision = named.get("revision") if self.revision is None else self.revision
+        return TransformerSource(key, model, revision)
 
 
 def too_long(tokens: int, longest: int) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ class CAdamTracker(CAdamSettings):
       opacity to reset,
     - :meth:`append`, :meth:`keep` or :meth:`follow` whenever rows of its tensors are added or removed.
 
-    The arithmetic is that of ``densifier=cadam``. The moments take 28 bytes per Gaussian.
+    The arithmetic is the same as in ``densifier=cadam``. The moments take 28 bytes per Gaussian.
     """
 
     means: InitVar[Float[Tensor, "n 3"]]  # read for its number of rows and its device only
@@ -122,7 +122,7 @@ class CAdamTracker(CAdamSettings):
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Continue from what :meth:`state_dict` returned, on the device of this tracker.
 
-        The number of Gaussians becomes that of ``state``.
+        The tracker then has as many Gaussians as ``state``.
         """
         device = self.state.age.device
         self.state = CAdamState(**{name: rows.to(device, copy=True) for name, rows in state.items()})

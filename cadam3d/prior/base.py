@@ -79,7 +79,7 @@ class DiffusionPrior(ABC):
     ) -> Float[Tensor, "v h w 3"]:
         """Invert :meth:`encode`: return images in [0, 1], without gradient.
 
-        ``height`` and ``width`` are those of the images that were encoded, in pixels.
+        ``height`` and ``width`` are the size of the encoded images, in pixels.
         """
 
     @abstractmethod

@@ -39,7 +39,7 @@ PRIORS = {
 }
 # Every model of this family has this factor between an image and its latents.
 FACTOR = 8  # pixels per side
-# The levels at which a network is used: those of the table that it was trained on, or any.
+# The levels at which a network is used: only the ones in the table that it was trained on, or any.
 LEVELS = ("table", "any")
 # A network recognises nothing in images of more than this many times the size of those in its training.
 LARGEST = 2
@@ -208,7 +208,7 @@ class LatentPrior(DiffusionPrior):
     def memory(self, prompt: str, negative: str, views: int, size: int | None) -> MemoryEstimate:
         """Estimate the memory of training from the configuration of the model alone.
 
-        The working memory is that of the denoiser or of the autoencoder, whichever is larger. Renders have
+        The working memory is what the denoiser or the autoencoder needs, whichever is larger. Renders have
         ``size`` pixels per side (512 if that is None too) unless the prior resizes them. Raises ``UserError``
         in the cases in which :meth:`embed` does, since training calls this first.
         """

@@ -1,6 +1,6 @@
 """MVDream as its authors published it: the tensor names of latent diffusion, read into classes of diffusers.
 
-The published file contains tensors but no configuration. The configuration is that of Stable Diffusion 2.1
+The published file contains tensors but no configuration. The configuration equals Stable Diffusion 2.1's
 with an input for cameras, and it is written down here.
 """
 
@@ -65,7 +65,7 @@ CONFIGURATIONS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class LatentDiffusion(Pretrained):
-    """A model in which some parts have the names of latent diffusion, and the others those of diffusers."""
+    """A model in which some parts have latent diffusion's names, and the others have diffusers' names."""
 
     # For each such part, the file of its tensors and the prefix of their names.
     files: Mapping[str, tuple[Path, str]]

@@ -22,7 +22,7 @@ from cadam3d.prior.texts import Texts
 
 VIEWS = 4  # per group
 # To read a noise level waits for a GPU, so only the first predictions of a run are checked there. These are
-# more than those of one step, because an inversion may begin at one level for all views.
+# more than one step's, because an inversion may begin at one level for all views.
 CHECKED = 100
 # The network reads a camera as a matrix of four by four numbers.
 CAMERA = 16
@@ -147,7 +147,7 @@ def camera_numbers(cameras: Cameras) -> Float[Tensor, "v 16"]:
     """Return camera-to-world matrices, flattened row by row, as the network reads them.
 
     World axes are the same as ours: +z up and the front at +x, as in the published code. Camera axes are
-    those of OpenGL: +x right, +y up, +z backward. Camera centres are moved to the unit sphere.
+    OpenGL's: +x right, +y up, +z backward. Camera centres are moved to the unit sphere.
     """
     to_world = cameras.world_to_camera[:, :3, :3].transpose(1, 2)
     axes = torch.cat([to_world[:, :, :1], -to_world[:, :, 1:]], dim=2)

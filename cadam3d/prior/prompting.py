@@ -149,7 +149,7 @@ class PerpNeg(Prompting):
 
     Armandpour et al. 2023 propose it against the Janus problem: a side view must not look like a front view.
     Let rho be 1 at the first view of a quarter (front, or side) and 0 at its second (side, or back). The
-    strengths are those of the released code:
+    strengths come from the released code:
 
     ==============  =======================  =====================================================
     quarter         repelled                 ``lucid`` (LucidDreamer, GCS-BEG)

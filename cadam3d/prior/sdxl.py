@@ -28,7 +28,7 @@ class StableDiffusionXL(StableDiffusion):
     upcasts: ClassVar = True
 
     def embed_texts(self, found: Pretrained, texts: Sequence[str], device: torch.device) -> Texts:
-        """Concatenate the penultimate states of both encoders; the pooled text is that of the second."""
+        """Concatenate the penultimate states of both encoders; the pooled text comes from the second."""
         first, second = (penultimate(found, part, texts, self.torch_dtype, device) for part in self.encoders)
         both = Texts(torch.cat([first.tokens, second.tokens], dim=-1), second.pooled)
         if not found.index.get("force_zeros_for_empty_prompt"):

@@ -14,7 +14,7 @@ LEAST = 4096
 
 
 class Forecast:
-    """Predicts the slots of renders of one size from those of earlier renders of this size.
+    """Predicts the slots of a render from earlier renders of the same size.
 
     Kernels write what they have counted to ``report``, in pinned memory, which a device can write and the
     host can read at any time. So the host never waits, and learns from a render as soon as it has been
@@ -22,7 +22,7 @@ class Forecast:
     """
 
     def __init__(self, device: torch.device) -> None:
-        # The number of Gaussians in the upper half, that of slots in the lower half; 0 before any report.
+        # The number of Gaussians in the upper half, of slots in the lower half; 0 before any report.
         self.report = torch.zeros(1, dtype=torch.int64, device="cpu", pin_memory=device.type == "cuda")
         self._reported = ctypes.c_uint64.from_address(self.report.data_ptr())
         # The largest recent number of slots per Gaussian, and the latest number of Gaussians.

@@ -83,7 +83,7 @@ def load_rasterization(device: torch.device) -> Rasterization:
         raise UserError("rasterizer=gsplat: torch sees no CUDA device. Try: cadam3d doctor")
     if find_spec("gsplat") is None:
         raise UserError(
-            "rasterizer=gsplat: expected the package gsplat, got none. Try: pip install 'cadam3d[gsplat]'"
+            "rasterizer=gsplat: expected the package gsplat, got none. Try: pip install '.[gsplat]'"
         )
     try:
         # gsplat reports about its build on the standard output, which belongs to the results of a command.
@@ -210,7 +210,7 @@ class _Tap:
 
 
 class _WithProbe(torch.autograd.Function):
-    """The identity of the means. Its backward pass runs after that of the images."""
+    """The identity of the means. Its backward pass runs after the backward pass of the images."""
 
     @staticmethod
     def forward(ctx, means: Tensor, probe: Tensor, tap: _Tap) -> Tensor:

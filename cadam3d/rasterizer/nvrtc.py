@@ -63,7 +63,7 @@ class Cubin:
 
 @cache
 def find_compiler() -> Nvrtc | None:
-    """Return the first NVRTC that loads: first those of the wheels, then those of the system.
+    """Return the first NVRTC that loads: first from the wheels, then from the system.
 
     In each of the two groups, the ones of torch's CUDA version come first.
     """

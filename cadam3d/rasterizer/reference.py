@@ -342,7 +342,7 @@ class _Shading:
         return torch.stack([*weighted, self.weight.sum(dim=1)], dim=1)
 
     def backward(self, grad: Float[Tensor, "b 5 p"], wants_absolute: bool) -> Float[Tensor, "b l c"]:
-        """Return the gradient of the table from that of the sums, summed over the pixels of a tile.
+        """Return the gradient of the table from the gradient of the sums, summed over the pixels of a tile.
 
         With ``wants_absolute``, two more columns contain the sums of the absolute values of what each pixel
         adds to the first two columns.

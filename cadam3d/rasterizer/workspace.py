@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-# Arrays begin at multiples of this, as those of torch's allocator do at least.
+# Arrays begin at multiples of this; torch's allocator aligns at least as much.
 ALIGNMENT = 256  # bytes
 # Whether every array gets an allocation of its own. A tool that checks each access to memory cannot see that
 # a kernel leaves one array for the next one in the same block. With such a tool this variable is set anyway,

@@ -72,7 +72,7 @@ def sections(metrics: Lines, charts: Sequence[Chart]) -> dict[str, list[DrawnCha
 
 
 def lines_of(metrics: Lines) -> tuple[list[Mapping[str, Any]], list[Mapping[str, Any]]]:
-    """Return the lines of steps and those of refinements, with their statistics beside their counts."""
+    """Return the lines of steps and of refinements, with their statistics beside their counts."""
     steps = [line for line in metrics if line.get("kind") == "step"]
     refinements = [line for line in metrics if line.get("kind") == "refine"]
     return steps, [
@@ -127,7 +127,7 @@ def draw(chart: Chart, lines: Lines, last_step: float) -> DrawnChart | None:
 
 
 def _colored(chart: Chart) -> list[tuple[Curve, int]]:
-    """Return the curves with the numbers of their colours; the last colour is that of thresholds."""
+    """Return the curves with the numbers of their colours; the last colour is for thresholds."""
     others = [curve for curve in chart.curves if not curve.is_threshold]
     colors = {curve: 1 + i % (THRESHOLD_COLOR - 1) for i, curve in enumerate(others)}
     return [(curve, colors.get(curve, THRESHOLD_COLOR)) for curve in chart.curves]

@@ -94,9 +94,9 @@ def mean(values: Mapping[str, float]) -> Mean | None:
 
 
 def change(ours: Mapping[str, float], theirs: Mapping[str, float]) -> Mean | None:
-    """Return by how many percent the mean of ``ours`` exceeds that of ``theirs``; both have the same prompts.
+    """Return by how many percent ``ours`` exceeds ``theirs`` on average; both have the same prompts.
 
-    The interval is that of the ratio of two paired means by linearisation: the mean of ``ours - ratio *
+    The interval is for the ratio of two paired means, by linearisation: the mean of ``ours - ratio *
     theirs`` is 0, and its interval is divided by the mean of ``theirs``. None without a prompt, and if the
     mean of ``theirs`` is 0.
     """
@@ -219,7 +219,7 @@ def settings_of(results: Iterable[JobResult], arm: str) -> list[ArmSetting]:
 
 
 def gain_over(reference: Sequence[JobResult], value: Value) -> Value:
-    """Return a function: the value of a result minus that of its job without growth in ``reference``.
+    """Return a function: the value of a result minus the value of its job without growth in ``reference``.
 
     The job without growth has the same prompt and seed. The function returns None where that job or the
     value is missing, and the plain value if ``reference`` holds no job without growth at all.
@@ -265,7 +265,7 @@ class FrontierPoint:
 def frontier(results: Sequence[JobResult], arm: str, gain: Value) -> list[FrontierPoint]:
     """Return the settings of ``arm``, those with fewest Gaussians first.
 
-    ``results`` are those of one noise level. ``gain`` returns the quality of a result, such as
+    ``results`` belong to one noise level. ``gain`` returns the quality of a result, such as
     :func:`gain_over`; cells without it are left out.
     """
     points = []

@@ -116,10 +116,13 @@ def read_table(sweep: Path) -> PaperTable | None:
 def write(sweep: Path) -> str:
     """Write the table in all formats, and return it as Markdown; "" if there is none.
 
-    Raises ``UserError`` if a file cannot be written.
+    Files of an earlier line that asked for the table are removed then. Raises ``UserError`` if a file cannot
+    be written.
     """
     table = read_table(sweep)
     if table is None:
+        for name in FORMATS:
+            (sweep / name).unlink(missing_ok=True)
         return ""
     for name, write_as in FORMATS.items():
         with replacing(sweep / name) as temporary:

@@ -40,7 +40,7 @@ class TableRow:
 
 @dataclass(frozen=True)
 class PaperTable:
-    """The paper's table 1 of a sweep: the rows of all prompts, and then those of each category."""
+    """The paper's table 1 of a sweep: the rows of all prompts, and then of each category."""
 
     numbers: list[Number]  # one for each column
     rows: list[TableRow]

@@ -37,7 +37,7 @@ def _row(objective: str, recipe: str, arm: str, line: str) -> PublishedRow:
     return PublishedRow(objective, recipe, arm, dict(zip(names, line.split(), strict=True)))
 
 
-# The first row of each objective is that of the baseline.
+# The first row of each objective is the baseline.
 ROWS = (
     _row("SDS", "gaussiandreamer", "baseline", "30.14 -0.125 0.194 9.908 1067K 46.4MB"),
     _row("SDS", "gaussiandreamer", "cadam", "29.95 -0.028 0.185 9.643 143K 6.1MB"),

@@ -37,7 +37,7 @@ SEED, PROMPT, NOISE, GUIDANCE, RECIPE = "seed", "prompt", "noise", "guidance", "
 
 @dataclass(frozen=True)
 class ArmSetting:
-    """An arm and those of its thresholds that the sweep varies, if there are any."""
+    """An arm, with the thresholds that the sweep varies, if there are any."""
 
     arm: str
     thresholds: tuple[tuple[str, float | str], ...] = ()
@@ -124,7 +124,7 @@ class JobResult:
 def read(sweep_folder: Path) -> list[JobResult]:
     """Return every job of the sweep in ``sweep_folder``, in order, whether it is done or not.
 
-    Keys that vary within an arm are distinguished: those of the densifier are thresholds, all others are axes
+    Keys that vary within an arm are distinguished: the densifier's are thresholds, all others are axes
     of the cells. A key that only differs between arms belongs to the arm. Raises ``UserError`` if
     the folder holds no sweep.
     """

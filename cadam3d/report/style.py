@@ -134,7 +134,7 @@ def svg_of(figure: Figure, name: str, dpi: float) -> str:
 def inline(svg: str) -> str:
     """Return an SVG file as a part of an HTML page.
 
-    The prolog, metadata, names of groups, fonts (those of the page are used) and decimals beyond a hundredth
+    The prolog, metadata, names of groups, fonts (the page's own are used) and decimals beyond a hundredth
     of a point are left out, and colours become variables of the page. The variable ``--least`` holds the
     smallest width at which the text of the drawing is legible.
     """

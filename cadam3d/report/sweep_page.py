@@ -40,7 +40,7 @@ FRONTIER = (
     "threshold has it beside each mark, and the standard setting is ringed. Bars hold the middle half of the "
     "cells. A dagger means that jobs ended early."
 )
-# The figures of every sweep. A sweep also has those of declared scores, and a grid may name "frontier_NAME",
+# The figures of every sweep. A sweep also has declared scores, and a grid may name "frontier_NAME",
 # the frontier of any other number.
 KINDS = {
     "frontier": FigureKind(figures.frontier_figure, "Quality against count", FRONTIER),
@@ -177,7 +177,7 @@ def _title(plan: Plan, results: Sequence[JobResult]) -> str:
 
 
 def _commands(plan: Plan) -> str:
-    """Return the command line of the sweep and that of each of its jobs."""
+    """Return the command lines of the sweep and of each job."""
     lines = [[plan.command, *plan.line]] if plan.line else []
     lines += [["train", *job.overrides] for job in plan.jobs]
     return "\n".join(shlex.join(["cadam3d", *map(str, line)]) for line in lines)

@@ -111,7 +111,7 @@ def compose(
 
 @contextmanager
 def _own_hydra(folder: Path) -> Iterator[None]:
-    """Initialize Hydra with a folder of YAML files, and restore that of the calling program afterwards."""
+    """Initialize Hydra with a folder of YAML files, and restore the calling program's folder afterwards."""
     outer, version = GlobalHydra.instance().hydra, VersionBase.instance().version_base
     GlobalHydra.instance().clear()
     try:

@@ -80,7 +80,7 @@ class Library:
         return SENTENCE_END.split(about.partition("\n")[0], maxsplit=1)[0]
 
     def groups(self, command: str) -> dict[str, Choices]:
-        """Return the groups of a command, with those of the command that it builds on first."""
+        """Return the groups of a command; the groups of the command that it builds on come first."""
         path = self._command(command)
         entries = [found for line in read_text(path).splitlines() if (found := ENTRY.match(line))]
         words = {entry[1]: entry[2] or "" for entry in entries}
@@ -103,9 +103,9 @@ class Library:
         return Option(about=about_of(read_text(path)), settings=settings, changed=tuple(own))
 
     def option(self, group: str, name: str, command: str = "train") -> Option:
-        """Return an option with all its settings, including those of the option that it builds on.
+        """Return an option with all its settings, including the settings of the option that it builds on.
 
-        An option may also change settings and groups elsewhere. Their words are those of ``command``.
+        An option may also change settings and groups elsewhere. Their words come from ``command``.
         """
         path = option_file(group, name, self.folders)
         values, content = read_option(group, name, self.folders), read_yaml(path)

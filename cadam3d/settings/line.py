@@ -81,7 +81,7 @@ class Line:
 
 
 class _Flags(argparse.ArgumentParser):
-    """The flags of every command, which are those of Hydra that are of use here."""
+    """The flags of every command: the ones of Hydra that are useful here."""
 
     def __init__(self) -> None:
         super().__init__(add_help=False, allow_abbrev=False)
@@ -211,7 +211,7 @@ def _entry(override: str) -> str:
 
 
 def _merge(merged: dict[str, str], override: str) -> None:
-    """Add one more override to those of a run, in place. Overrides that it cancels are removed."""
+    """Add one more override to a run's overrides, in place. Overrides that it cancels are removed."""
     entry, key = _entry(override), key_of(override)
     old = merged.get(key, "")
     if entry != key:  # ~key

@@ -104,7 +104,7 @@ def load_class(target: object, key: str) -> type:
 def default_options(command: str = "train") -> dict[str, str | list[str] | None]:
     """Return the option that each group of a command has by default: a list where several can be chosen.
 
-    Groups of the command that it builds on come first, so those of ``sweep`` begin with those of ``train``.
+    Groups of the command that it builds on come first, so ``sweep`` begins with the groups of ``train``.
     """
     found: dict[str, Any] = {}
     for entry in read_yaml(config_dir() / f"{command}.yaml").get("defaults", ()):

@@ -20,7 +20,7 @@ COMPARING = ("preview", "turntable")
 def exporting(overrides: Sequence[str], folders: Sequence[Path] = ()) -> list[str]:
     """Choose the exporter for a file that ``output=`` names by its suffix.
 
-    ``folders`` have the YAML files of the line, by default those of the package. A line does not change if it
+    ``folders`` have the YAML files of the line, by default the package's. A line does not change if it
     names no file, or if it chooses the exporter in another way: with ``for=``, with ``exporter=``, or by
     setting an exporter that writes no such file. Raises ``UserError`` if no exporter writes such a file.
     """

@@ -2,7 +2,7 @@
 
 Hydra builds whatever a ``_target_`` names, so a setting could run any code. A folder may therefore say only
 what changes the settings of training: options of the groups, and plain values for settings. A ``_target_``
-must be one that the YAML files of this call (those of the package and of ``--config-dir``) name themselves;
+must be one that the YAML files of this call (from the package and from ``--config-dir``) name themselves;
 ``cadam3d.settings.check`` refuses one in a wrong place. Nothing from a folder reaches Hydra's own settings,
 an interpolation calls no function, folders of caches are never taken from a run, because compiled kernels are
 loaded from there, and everything in the folder is a file, a folder, or a link that stays inside.

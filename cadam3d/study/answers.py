@@ -46,7 +46,7 @@ class Rater:
     """
 
     name: str  # unique in a study
-    answers: tuple[Answer, ...]  # without those of catch trials
+    answers: tuple[Answer, ...]  # without catch trials
     catches: tuple[bool, ...]  # for each answered question of a catch trial, whether the answer was right
 
 

@@ -66,7 +66,7 @@ def margin(influences: Float[np.ndarray, "n"], clusters: Clusters) -> float:
     ``influences`` says by how much each answer moves the estimate; they sum to 0. The variance has three
     parts: what single answers contribute, and what raters, and what prompts, contribute beyond that. It is
     the two-way clustered variance of Cameron, Gelbach and Miller (2011), ``V_rater + V_prompt - V_answer``,
-    except that no part is negative. The degrees of freedom of t are those of Welch and Satterthwaite, but at
+    except that no part is negative. The degrees of freedom of t follow Welch and Satterthwaite, but at
     least the smaller number of clusters minus 1. With a single rater the interval is about prompts alone, and
     with a single prompt about raters alone.
     """
@@ -196,7 +196,7 @@ def strength_margins(
     """Return half the width of the 95 % interval of each strength, measured from the mean of all arms.
 
     ``chosen`` and ``other`` are the positions of the arms that won and lost each answer. For two arms, the
-    interval of the difference of their strengths is that of :func:`rate_interval`, in log-odds.
+    interval of the difference of their strengths comes from :func:`rate_interval`, in log-odds.
     """
     inverse = np.linalg.pinv(_information(count_wins(chosen, other, len(strengths)), strengths))
     surprise = expit(strengths[other] - strengths[chosen])

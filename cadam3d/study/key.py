@@ -25,7 +25,7 @@ LARGEST_KEY = 1 << 24  # bytes
 class KeyClip:
     """The facts about what a clip shows."""
 
-    arm: str  # of a ruined clip, that of its run
+    arm: str  # of a ruined clip, its run's arm
     prompt: str
     seed: int
     conditions: dict[str, str]

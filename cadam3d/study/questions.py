@@ -13,7 +13,7 @@ class Question:
     text: str  # the question on the page
 
 
-# The names and their order are those of the paper's table of the user study; the wording is ours, because the
+# The names and their order come from the paper's table of the user study; the wording is ours, because the
 # paper prints only the names.
 QUESTIONS = (
     Question("text_alignment", "TA", "Text alignment", "Which object matches the description better?"),

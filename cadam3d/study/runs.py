@@ -53,7 +53,7 @@ class RunPair:
 def find_runs(places: Sequence[str], labels: Sequence[str] | None) -> list[StudyRun]:
     """Return the runs with an asset of all arms that ``runs=`` names.
 
-    A single place is the folder of a sweep, and its arms are those of its report. Of several places, each is
+    A single place is the folder of a sweep, and its arms are its report's arms. Of several places, each is
     an arm: a run, a sweep, or a folder with runs in it. ``labels`` are the names of these arms, by default
     those of the folders. Raises ``UserError`` if a place is not one of these, or if names are missing.
     """

@@ -33,7 +33,7 @@ from cadam3d.sweep.plan import (
 
 SEED = "seed="  # the name of the folder of an attempt begins with it
 PARENT = Path(LATEST).parent
-# The settings of a line that are not those of a single attempt.
+# The settings of a line that no single attempt has.
 OF_THE_LINE = ("attempts", "select", RUN_FOLDER)
 
 
@@ -124,7 +124,7 @@ def attempt_of(row: Row) -> Attempt:
         {name: float(known[name]) for name in numbers if is_number(known.get(name))}
         for known in (summary, evaluation)
     )
-    # As in the tables, scores of an evaluation replace those of training. ``require_one_method`` then refuses
+    # As in the tables, scores of an evaluation replace training's. ``require_one_method`` then refuses
     # to compare scores that were measured in different ways.
     scores = {name: score.value for name, score in read_scores(row.folder, summary).items()}
     own = measured | {name: scores[name] for name in numbers if name in scores}

@@ -84,7 +84,7 @@ HasSetting = Callable[[Sequence[str], str], bool]
 def read_grid(node: Any) -> Grid:
     """Return the grid that plain dicts and lists describe; None describes a grid of one nameless arm.
 
-    Raises ``UserError`` for keys other than those of :class:`Grid` and for wrong values of these.
+    Raises ``UserError`` for keys that :class:`Grid` does not have and for wrong values of these.
     """
     if node is None:
         return Grid(each={}, arms={"": {}})
@@ -185,7 +185,7 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
 
 
 def swept_keys(grid: Grid, line: Axes) -> list[str]:
-    """Return the keys in which jobs may differ: those of the grid, and those with several values in the line.
+    """Return the keys in which jobs may differ: the grid's, and those with several values in the line.
 
     Prompt and seed count too if the line gives them: another prompt is another job, not another setting of
     all jobs. Settings that come with prompts count as well, unless the line has one value for all jobs.
@@ -199,7 +199,7 @@ def swept_keys(grid: Grid, line: Axes) -> list[str]:
 def sweep_name(grid_name: str | None, line: Axes, prompts: PromptChoice | None = None) -> str:
     """Return the name of the folder of a sweep: the name of its grid, or else a summary of the line.
 
-    If the prompts are those of a file or a set, its name stands for them. Each shard has its own folder.
+    If the prompts come from a file or a set, its name stands for them. Each shard has its own folder.
     """
     suffix = "_shard-{}-of-{}".format(*prompts.shard) if prompts and prompts.shard else ""
     if grid_name:

@@ -248,7 +248,7 @@ def folder_of(cfg: DictConfig, parts: Parts, usual: Path) -> Path:
 
 
 def _read_prompts(cfg: DictConfig, grid: Grid, axes: Axes) -> PromptChoice | None:
-    """Return the choice of prompts of a line or its grid. A prompt in the line replaces those of the grid.
+    """Return the choice of prompts of a line or its grid. A prompt in the line replaces the grid's prompts.
 
     Raises ``UserError`` if the line has both a prompt and a choice of prompts.
     """
@@ -263,7 +263,7 @@ def _read_prompts(cfg: DictConfig, grid: Grid, axes: Axes) -> PromptChoice | Non
 
 
 def sort_overrides(overrides: Sequence[str]) -> Parts:
-    """Separate the overrides of jobs from those of the sweep. Raises ``UserError`` for keys of neither."""
+    """Separate the overrides of jobs from the sweep's own. Raises ``UserError`` for keys of neither."""
     parts = Parts(grid=search_path(overrides), launcher=[], folder=[], jobs=[])
     for override in overrides:
         key = key_of(override)

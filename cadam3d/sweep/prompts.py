@@ -36,7 +36,7 @@ class PromptChoice:
         return f"{KEY}={json.dumps(parts)}"
 
     def read(self) -> tuple[Prompt, ...]:
-        """Return the chosen prompts: those of the category, the first of these, and of these the shard.
+        """Return the chosen prompts: the category's, the first of these, and of these the shard.
 
         Shards are consecutive and differ in length by one prompt at most. Raises ``UserError`` if nothing is
         chosen.

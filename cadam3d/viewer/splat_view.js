@@ -4,7 +4,7 @@
  *   await view.load(arrayBuffer);
  *   view.show("depth");
  *
- * The pictures are those of the rasterizers of cadam3d: EWA splatting with a blur of 0.3 pixels^2, contributions below
+ * The pictures equal the ones that cadam3d's rasterizers draw: EWA splatting with a blur of 0.3 pixels^2, contributions below
  * 1/255 skipped and above 0.99 capped, and colours that are blended as they are. Angles are in degrees and lengths in
  * world units: +z is up, and azimuth 0 looks at the front of the object, which faces +x.
  */
@@ -332,7 +332,7 @@ globalThis.SplatView = (() => {
   const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
   const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 
-  /* Return position and rows (right, down, forward) of a camera: those of cadam3d.core.cameras.orbit. */
+  /* Return position and rows (right, down, forward) of a camera, as cadam3d.core.cameras.orbit computes them. */
   function pose({ azimuth, elevation, distance, target }) {
     const [a, e] = [azimuth * DEGREE, elevation * DEGREE];
     const outward = [Math.cos(e) * Math.cos(a), Math.cos(e) * Math.sin(a), Math.sin(e)];

@@ -139,7 +139,7 @@ def test_a_missing_package_names_its_extra(name, monkeypatch):
     with pytest.raises(UserError) as raised:
         components(composed(f"callback=[{name}]", "prompt=a").callback, Callback, "callback")
     assert str(raised.value) == (
-        f"callback={name}: expected the package {name}, got none. Try: pip install 'cadam3d[{name}]'"
+        f"callback={name}: expected the package {name}, got none. Try: pip install '.[{name}]'"
     )
 
 

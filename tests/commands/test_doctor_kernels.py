@@ -83,7 +83,7 @@ def test_with_nothing_installed_the_reference_is_tested_and_the_rest_is_named_as
     found = by_topic()
     assert found["rasterizer=reference"].verdict is Verdict.OK
     assert not [finding for finding in found.values() if finding.verdict is Verdict.BROKEN]
-    assert "pip install 'cadam3d[compiler]'" in found["kernels for cpu"].found
+    assert "pip install '.[compiler]'" in found["kernels for cpu"].found
     assert "rasterizer=cpu" not in found
     assert found["kernels for cuda"].found == "torch sees no CUDA device; no NVRTC was found"
     choice = found["rasterizer=auto"]
@@ -142,7 +142,7 @@ def test_a_gpu_without_gsplat_gets_the_command_that_installs_it(a_gpu, monkeypat
     monkeypatch.setattr(gsplat, "find_spec", lambda name: None)
     found = by_topic()
     assert found["kernels for gsplat"].verdict is Verdict.NOTE
-    assert found["kernels for gsplat"].found.endswith("Try: pip install 'cadam3d[gsplat]'")
+    assert found["kernels for gsplat"].found.endswith("Try: pip install '.[gsplat]'")
     assert "rasterizer=gsplat" not in found
 
 

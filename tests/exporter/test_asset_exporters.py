@@ -92,8 +92,7 @@ def test_a_missing_package_is_reported_before_anything_runs(monkeypatch, name, s
     with pytest.raises(UserError) as caught:
         built(name, **settings)
     assert (
-        str(caught.value)
-        == f"{key}: needs gaussforge, which is not installed. Try: pip install 'cadam3d[formats]'"
+        str(caught.value) == f"{key}: needs gaussforge, which is not installed. Try: pip install '.[formats]'"
     )
 
 

@@ -126,4 +126,4 @@ def test_without_the_package_one_line_says_what_to_install(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "ImageReward", None)
     text = refusal(folder)
     assert text.startswith("metric.image_reward: the package image-reward cannot be imported")
-    assert "Try, in a new environment: pip install 'cadam3d[image_reward]' openai-clip" in text
+    assert "Try, in a new environment: pip install '.[image_reward]' openai-clip" in text

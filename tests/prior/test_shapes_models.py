@@ -124,7 +124,7 @@ def test_without_the_extra_the_message_says_what_to_install(name, models, monkey
     found = importlib.util.find_spec
     monkeypatch.setattr(pretrained, "find_spec", lambda each: None if each == "diffusers" else found(each))
     done = type_line("train", f"prior={name}", "prompt=a red cube")
-    assert done.message == "prior: needs diffusers. Try: pip install 'cadam3d[diffusers]'"
+    assert done.message == "prior: needs diffusers. Try: pip install '.[diffusers]'"
     assert doctor._prior(f"prior={name}").hint == ""
 
 

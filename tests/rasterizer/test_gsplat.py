@@ -374,7 +374,7 @@ def message_of(device=GPU) -> str:
 
 def test_a_missing_package_is_refused_with_the_command_that_installs_it(a_gpu, monkeypatch):
     monkeypatch.setattr(adapter, "find_spec", lambda name: None)
-    assert message_of().endswith("got none. Try: pip install 'cadam3d[gsplat]'")
+    assert message_of().endswith("got none. Try: pip install '.[gsplat]'")
 
 
 def test_a_failed_build_is_quoted_in_one_line(a_gpu, monkeypatch):

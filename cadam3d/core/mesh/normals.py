@@ -23,7 +23,7 @@ SHORTEST = 1e-4
 def facing_normals(gaussians: Gaussians, camera: Cameras) -> Float[Tensor, "n 3"]:
     """Return the unit normal of each Gaussian, turned towards a single camera.
 
-    Its axes are those of normal maps: right, up, towards the camera.
+    Its axes are the axes of normal maps: right, up, towards the camera.
     """
     shortest = gaussians.log_scales.argmin(dim=1)
     axes = gaussians.rotations.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]

@@ -171,7 +171,7 @@ def _arc_sdf(p: Tensor, size: Tensor) -> Tensor:
     x, ring, sine, cosine = p[0].abs(), size[0], size[2], size[3]
     away = root(x * x + p[1] * p[1]) - ring
     dx, dy = x - ring * sine, p[1] - ring * cosine
-    # The sine of the difference between the angle of the point and that of the end.
+    # The sine of the difference between the angles of the point and of the end.
     is_beyond = x * cosine > p[1] * sine
     return root(torch.where(is_beyond, dx * dx + dy * dy, away * away) + p[2] * p[2]) - size[1]
 
