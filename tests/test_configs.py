@@ -22,7 +22,6 @@ from cadam3d.build import component, components
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json, read_jsonl
 from cadam3d.io.prompt_files import read_prompts
-from cadam3d.settings import advice
 from cadam3d.settings.compose import compose, flatten, quote
 from cadam3d.settings.line import read_flags
 from cadam3d.settings.options import config_dir
@@ -294,9 +293,7 @@ def test_a_launcher_configures_a_launcher_of_hydra(path):
     assert text.startswith("# @package _global_\n")
     assert "pip install" in text
     content = yaml.safe_load(text)
-    [override] = content["defaults"]
-    name = override["override /hydra/launcher"]
-    assert name in advice.LAUNCHERS
+    assert [*content["defaults"][0]] == ["override /hydra/launcher"]
     used = set(re.findall(r"\$\{launcher\.(\w+)\}", text))
     assert used | {"threads"} == content["launcher"].keys()
 

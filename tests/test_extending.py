@@ -163,9 +163,9 @@ def test_a_sweep_and_a_choice_use_the_metric(place, run):
         "eval run=both 'metric=[outliers]' --config-dir myconfigs",
         f"train prompt='a red torus' attempts=2 select=outliers {flags}",
     ]
-    _, table, choice = (run_line(place, f"PYTHONPATH=. cadam3d {line}") for line in lines)
+    _, _, choice = (run_line(place, f"PYTHONPATH=. cadam3d {line}") for line in lines)
     header = (place / "both/sweep.csv").read_text(encoding="utf-8").splitlines()[0]
     assert "outliers" in header.split(",")
     assert "outliers" in (place / "both/report.html").read_text(encoding="utf-8")
-    assert "outliers" in table
+    assert "outliers" in (place / "both/eval.json").read_text(encoding="utf-8")
     assert "by share of outliers: seed=" in choice

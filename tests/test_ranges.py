@@ -37,7 +37,7 @@ BEYOND = {
     "initializer=ball": "count=0 radius=0 radius=1.5 scale=0 opacity=1 sh_degree=4 color=[0.5,0.5] "
     "color_noise=-0.1",
     "initializer=mesh": "up=x turn_deg=45 radius=2 count=0 opacity=0 color=[1]",
-    "initializer=shap_e": "ids=openai/shap-e dtype=half prompt='' steps=0 guidance_scale=0.5 grid_size=1 "
+    "initializer=shap_e": "ids=openai/shap-e dtype=half steps=0 guidance_scale=0.5 grid_size=1 "
     "turn_deg=45 radius=2 factor=0 lift=2 tone=dark color=[2,0,0] replicate_law=shell scale_law=median "
     "count=0 grow_points=-1 grow_distance=0 grow_noise=2 replicate=0 scale=0 sh_degree=4",
     "callback=checkpoint": "every=0 keep=0",
@@ -52,7 +52,7 @@ BEYOND = {
     "prior=shapes_flow": "noise_path.shift=0 noise_path.shift=.nan",
     "prior=tiny": "predicts=clean width=20 width=64 downscale=0 seed=-1",
     "prior=stable_diffusion": "size=100 size=0 dtype=int8 micro_batch=0 text_device=moon noise_levels=whole",
-    "prior=mvdream": "micro_batch=1 micro_batch=6 rescale=1.5 rescale=-0.1 tokenizer=''",
+    "prior=mvdream": "micro_batch=1 micro_batch=6 rescale=1.5 rescale=-0.1",
     "prompting=discrete": "back_deg=170 front_deg=-1",
     "prompting=compass": "below_deg=-91 above_deg=-30",
     "prompting=perp_neg": "curve=other overhead_deg=100",

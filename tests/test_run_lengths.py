@@ -34,7 +34,7 @@ def evaluated(value, steps: int):
     """Return what a value of a YAML file is in a run of ``steps`` steps."""
     if value == "${steps}":
         return steps
-    call = re.fullmatch(r"\$\{parts:(\d+),(\d+),\$\{steps\}(?:,(\d+))?\}", str(value))
+    call = re.fullmatch(r"\$\{cadam3d\.parts:(\d+),(\d+),\$\{steps\}(?:,(\d+))?\}", str(value))
     return parts(int(call[1]), int(call[2]), steps, int(call[3] or 1)) if call else value
 
 

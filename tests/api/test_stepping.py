@@ -138,16 +138,6 @@ def test_a_densifier_of_the_caller_decides_what_grows():
     assert len(state.gaussians) == refinements[-1].after > 20
 
 
-def test_a_densifier_that_returns_no_mask_is_refused(without_type_checks):
-    class Numbers(First):
-        def select(self, state, step, generator):
-            return state.zeros[:1]
-
-    trainer = cadam3d.compose(*SMALL, densifier=Numbers())
-    with pytest.raises(cadam3d.UserError, match=r"Numbers: expected a mask from select: .* of shape \(20,\)"):
-        list(trainer.run(trainer.start()))
-
-
 def test_every_component_that_is_given_is_used():
     objects = {
         name: component(composed(*SMALL)[name])

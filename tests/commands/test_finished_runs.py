@@ -360,7 +360,6 @@ def test_runs_with_equal_densifiers_are_labelled_by_their_folders_and_equal_fold
     ("words", "message"),
     [
         (("run=[b]",), "run: expected 2 to 12 runs, got 1. Try: run=outputs/latest"),
-        (("run=[]",), "run: expected 2 to 12 runs, got 0. Try: run=outputs/latest"),
         (("run=[b,nowhere]",), "run: expected the folder of a run, got 'nowhere' (no such folder). Try: "),
         (
             ("run=[b,b]", "labels=[a]"),

@@ -49,7 +49,7 @@ def test_a_backend_is_noted_only_if_it_replaces_a_faster_one(capsys):
     messages.note_backend(Backend("cpu"))
     messages.note_backend(Backend("reference", reason="No compiler. Install one"))
     assert capsys.readouterr().err == (
-        "Note: rendering with rasterizer=reference, which is slow: No compiler. Install one\n"
+        "Note: rendering with rasterizer=reference: No compiler. Install one\n"
     )
 
 
@@ -57,7 +57,7 @@ def test_training_without_a_compiler_is_noted_once_and_recorded(type_line, no_co
     code, _, err = type_line("train", *SMALL)
     assert code == 0
     assert err.count(NEEDED) == 1
-    assert f"\nNote: rendering with rasterizer=reference, which is slow: {NEEDED}\n" in err
+    assert f"\nNote: rendering with rasterizer=reference: {NEEDED}\n" in err
     assert "Warning" not in err
     run = tmp_path / "outputs/latest"
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))

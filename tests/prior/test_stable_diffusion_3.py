@@ -80,7 +80,7 @@ def test_t5_may_be_missing_if_it_is_not_used(prior, folder, tmp_path):
     assert there.found.has("text_encoder_3")
     expected = replace(prior, t5=False).embed("a red cube", "").texts.tokens
     torch.testing.assert_close(there.embed("a red cube", "").texts.tokens, expected)
-    with pytest.raises(UserError, match=r"^prior: .*text_encoder_3"):
+    with pytest.raises(UserError, match="text_encoder_3"):
         replace(there, t5=True).embed("a red cube", "")
 
 
