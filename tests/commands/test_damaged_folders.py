@@ -205,7 +205,7 @@ def test_a_damaged_newest_checkpoint_is_left_out_with_a_note(finished, tmp_path,
     notes = [line for line in capsys.readouterr().err.splitlines() if "left out" in line]
     assert len(notes) == 1
     assert "step_0000004.pt" in notes[0]
-    assert "step: expected that of its name, got 2" in notes[0]
+    assert "step: expected the step in its name, got 2" in notes[0]
     lines = [json.loads(line) for line in Path("run/metrics.jsonl").read_text().splitlines()]
     assert lines[-1]["step"] == 4
 

@@ -77,7 +77,7 @@ def test_a_position_beyond_spz_4_is_one_message(tmp_path):
 @pytest.mark.parametrize("kind", WRITERS)
 def test_without_the_package_the_message_names_the_extra(tmp_path, monkeypatch, kind):
     monkeypatch.setattr(gaussforge, "find_spec", lambda _: None)
-    hint = r"Try: pip install 'cadam3d\[formats\]'$"
+    hint = r"Try: pip install '\.\[formats\]'$"
     message = rf"exporter\.{kind}: needs gaussforge, which is not installed\. {hint}"
     with pytest.raises(UserError, match=message):
         WRITERS[kind](tmp_path / "a", random_gaussians(3), up="-y")

@@ -208,5 +208,5 @@ def test_offline_mode_is_respected_and_reported(hub, monkeypatch):
 
 def test_a_missing_extra_is_reported_with_the_command_that_installs_it(monkeypatch):
     monkeypatch.setattr(pretrained, "find_spec", lambda name: None if name == "diffusers" else object())
-    with pytest.raises(UserError, match=r"prior: needs diffusers. Try: pip install 'cadam3d\[diffusers\]'"):
+    with pytest.raises(UserError, match=r"prior: needs diffusers. Try: pip install '\.\[diffusers\]'"):
         source().find(KINDS, OTHERS)
