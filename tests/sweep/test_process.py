@@ -298,7 +298,8 @@ def test_a_launcher_handles_the_end_of_its_time_once_the_job_has_saved(sweep):
 
 
 def test_a_job_ends_with_the_process_that_started_it():
-    code = "import time; from cadam3d.sweep import process; process.end_with(PARENT); time.sleep(60)"
+    code = "import time; from cadam3d.sweep import process; process.end_with(PARENT); "
+    code += "print('ready', flush=True); time.sleep(60)"
     job = [sys.executable, "-c", code.replace("PARENT", "__import__('os').getppid()")]
     launch = f"import subprocess, time; print(subprocess.Popen({job!r}).pid, flush=True); time.sleep(60)"
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
@@ -307,10 +308,11 @@ def test_a_job_ends_with_the_process_that_started_it():
     )
     assert worker.stdout is not None
     pid = int(worker.stdout.readline())
-    time.sleep(0.2)
-    assert Path(f"/proc/{pid}").exists() or not Path("/proc").exists()
+    assert worker.stdout.readline() == "ready\n"
+    assert is_alive(pid)
     worker.kill()
-    worker.communicate()
+    # The job holds the other end of the pipe, so this waits for the job too.
+    worker.communicate(timeout=30)
     deadline = time.monotonic() + 30
     while is_alive(pid):
         assert time.monotonic() < deadline
