@@ -5,32 +5,12 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from harsh_prompts import HARSH
 
 from cadam3d.core.errors import UserError
 from cadam3d.io import prompt_files as module
 from cadam3d.io.prompt_files import Prompt, read_prompts
 from cadam3d.prior.shapes.grammar import parse
-
-# What commas, quotes, brackets, references and other scripts would change if they were not quoted.
-HARSH = [
-    "a corgi, front view, with a hat",
-    "a,b",
-    "12",
-    "null",
-    "a=b ~c +d",
-    "'quoted' and \"quoted\"",
-    "it's",
-    "back\\slash \\' \\\\",
-    "ends in a backslash\\",
-    "{a: [1, 2]}",
-    "range(0,3)",
-    "[a] #1 trophy",
-    "${oc.env:HOME}",
-    "\\${seed} ${seed",
-    "ein Würfel, куб, 立方体, مكعب 🧊👩‍🚀",
-    "a\tb",
-    "long " * 1900,
-]
 
 
 def texts(prompts) -> list[str]:

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from harsh_prompts import HARSH
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.prompt_files import Prompt
@@ -14,26 +15,6 @@ from cadam3d.sweep.plan import read_sweep
 from cadam3d.sweep.prompts import PromptChoice, read_choice
 from cadam3d.sweep.table import brief
 
-# What commas, quotes, brackets, references and other scripts would change if they were not quoted.
-HARSH = [
-    "a corgi, front view, with a hat",
-    "a,b",
-    "12",
-    "null",
-    "a=b ~c +d",
-    "'quoted' and \"quoted\"",
-    "it's",
-    "back\\slash \\' \\\\",
-    "ends in a backslash\\",
-    "{a: [1, 2]}",
-    "range(0,3)",
-    "[a] #1 trophy",
-    "${oc.env:HOME}",
-    "\\${seed} ${seed",
-    "ein Würfel, куб, 立方体, مكعب 🧊👩‍🚀",
-    "a\tb",
-    "long " * 1900,
-]
 # A line of a text file cannot hold these.
 LINES = ["one\ntwo", "one\r\n\u2028 two"]
 
