@@ -8,7 +8,7 @@ import torch
 from cadam3d.core.cameras import turntable
 from cadam3d.core.errors import UserError
 from cadam3d.core.schedule import Linear, Steps
-from cadam3d.guidance.distill import surrogate
+from cadam3d.guidance.distill import rms, surrogate
 from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
 from cadam3d.prior.tiny import Tiny
 
@@ -320,3 +320,8 @@ def test_every_number_of_a_chart_is_logged(objective, make, run, gaussian, means
     assert "residual_rms" in keys
     assert len(keys) == len(set(keys))
     assert set(keys) <= set(output.log)
+
+
+def test_the_root_mean_square_is_over_finite_elements():
+    assert rms(torch.tensor([3.0, torch.nan, 4.0, torch.inf])) == pytest.approx(12.5**0.5)
+    assert rms(torch.tensor([torch.nan, -torch.inf])) == 0

@@ -316,3 +316,14 @@ def test_the_address_is_on_loopback_and_has_a_new_token_each_time(run):
         assert one.address == f"http://127.0.0.1:{one.server_port}/{one.token}/"
         with Server(one.subject, 0) as other:
             assert one.token != other.token
+
+
+def test_a_request_that_is_too_long_is_refused(browser):
+    assert browser.post("stop", b"x" * 2000) == 413
+    assert browser.ask("POST", "stop", Origin=browser.origin)[0] == 413
+    assert browser.ask("DELETE", "state")[0] == 501
+
+
+@pytest.mark.parametrize("host", ["localhost:9000", "127.0.0.1:9000", "localhost"])
+def test_another_port_is_fine_because_a_tunnel_may_have_one(browser, host):
+    assert browser.get("state", host=host)[0] == 200
