@@ -11,7 +11,6 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from scipy.special import expit
 
 from cadam3d.core.errors import UserError
 from cadam3d.study.answers import Answer, Rater
@@ -20,13 +19,9 @@ from cadam3d.study.estimates import (
     Clusters,
     Interval,
     SignTest,
-    count_wins,
-    fit_strengths,
     holm,
-    is_ranked,
     rate_interval,
     sign_test,
-    strength_margins,
 )
 from cadam3d.study.questions import QUESTION_NAMES
 
@@ -83,25 +78,12 @@ class ComparedPair:
 
 
 @dataclass(frozen=True)
-class Strength:
-    """The strength of an arm in the Bradley-Terry model, relative to the average of all arms."""
-
-    arm: str
-    log_odds: float
-    preferred: float  # probability that it is chosen over an arm of average strength
-    interval: Interval  # of this probability, over raters and prompts
-
-
-@dataclass(frozen=True)
 class QuestionResult:
     """The result of one question."""
 
     question: str  # one of QUESTION_NAMES
     rates: tuple[Rate, ...]  # one for each arm that was compared, by name
     comparisons: tuple[ComparedPair, ...]  # one for each pair of arms that was compared
-    # The strongest arm is first. None for two arms, of which the rates say the same; empty if the answers do
-    # not determine the strengths.
-    strengths: tuple[Strength, ...] | None
 
 
 @dataclass(frozen=True)
@@ -183,7 +165,6 @@ def question_result(answers: Sequence[Answer]) -> QuestionResult:
             _rate(arm, [each for each in answers if arm in (each.chosen, each.other)]) for arm in arms
         ),
         comparisons=tuple(_comparison(*pair, _between(answers, *pair)) for pair in pairs),
-        strengths=_strengths(arms, answers) if len(arms) > 2 else None,
     )
 
 
@@ -223,19 +204,3 @@ def _comparison(first: str, second: str, answers: Sequence[Answer]) -> ComparedP
         p_value=p_value,
         corrected_p_value=p_value,
     )
-
-
-def _strengths(arms: Sequence[str], answers: Sequence[Answer]) -> tuple[Strength, ...]:
-    position = {arm: i for i, arm in enumerate(arms)}
-    chosen = np.array([position[answer.chosen] for answer in answers])
-    other = np.array([position[answer.other] for answer in answers])
-    wins = count_wins(chosen, other, len(arms))
-    if not is_ranked(wins):
-        return ()
-    values = fit_strengths(wins)
-    margins = strength_margins(chosen, other, _clusters(answers), values)
-    strengths = [
-        Strength(arm, float(value), float(expit(value)), Interval.around(float(value), float(half)))
-        for arm, value, half in zip(arms, values, margins, strict=True)
-    ]
-    return tuple(sorted(strengths, key=lambda each: (-each.log_odds, each.arm)))

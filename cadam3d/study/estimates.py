@@ -1,4 +1,4 @@
-"""Intervals and tests for answers that share raters and prompts, and the Bradley-Terry model.
+"""Intervals and tests for answers that share raters and prompts.
 
 The answers of one rater resemble each other, and so do the answers about one prompt. A formula for
 independent answers would give intervals that are far too narrow. All intervals here have one form: an
@@ -12,13 +12,10 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.optimize import minimize
-from scipy.sparse.csgraph import connected_components
-from scipy.special import expit, log_expit, logit, stdtrit
+from scipy.special import expit, logit, stdtrit
 from scipy.stats import binomtest
 
 CONFIDENCE = 0.95
-TOLERANCE = 1e-10  # of the gradient of the log-likelihood, per answer
 
 
 @dataclass(frozen=True)
@@ -27,11 +24,6 @@ class Interval:
 
     low: float
     high: float
-
-    @classmethod
-    def around(cls, log_odds: float, half: float) -> "Interval":
-        """Return the probabilities ``half`` below and above ``log_odds``."""
-        return cls(float(expit(log_odds - half)), float(expit(log_odds + half)))
 
     def excludes(self, value: float) -> bool:
         """Return whether ``value`` is outside."""
@@ -54,10 +46,6 @@ class Clusters:
     def cells(self) -> Int[np.ndarray, "n"]:
         """Return the position of the pair of rater and prompt to which each answer belongs."""
         return np.unique(self.raters * (self.prompts.max() + 1) + self.prompts, return_inverse=True)[1]
-
-    def sizes(self) -> Int[np.ndarray, "3 n"]:
-        """Return for each answer how many answers share its rater, its prompt and its cell."""
-        return np.stack([np.bincount(each)[each] for each in (self.raters, self.prompts, self.cells)])
 
 
 def margin(influences: Float[np.ndarray, "n"], clusters: Clusters) -> float:
@@ -106,7 +94,8 @@ def rate_interval(chosen: Bool[np.ndarray, "n"], clusters: Clusters) -> Interval
     if share == 0:
         return Interval(0.0, 1 - _unanimous(clusters))
     half = margin((chosen - share) / (len(chosen) * share * (1 - share)), clusters)
-    return Interval.around(float(logit(share)), half)
+    low, high = expit(logit(share) + np.array([-half, half]))
+    return Interval(float(low), float(high))
 
 
 def _unanimous(clusters: Clusters) -> float:
@@ -120,7 +109,9 @@ def _unanimous(clusters: Clusters) -> float:
     exact = ((1 - CONFIDENCE) / 2) ** (1 / units)
     # Answers that share rater, prompt and cell with equally many others are interchangeable. One of each kind
     # is reversed, and the lowest bound counts.
-    _, kinds = np.unique(clusters.sizes(), axis=1, return_index=True)
+    groupings = (clusters.raters, clusters.prompts, clusters.cells)
+    sizes = np.stack([np.bincount(groups)[groups] for groups in groupings])
+    _, kinds = np.unique(sizes, axis=1, return_index=True)
     positions = np.arange(len(clusters.cells))
     turned = min(rate_interval(positions != i, clusters).low for i in kinds)
     return max(exact, turned)
@@ -152,68 +143,3 @@ def holm(p_values: Sequence[float]) -> list[float]:
         highest = max(highest, min(1.0, p_values[i] * (len(p_values) - rank)))
         corrected[i] = highest
     return corrected
-
-
-def fit_strengths(wins: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k"]:
-    """Return the strengths of k arms in the model of Bradley and Terry (1952), by maximum likelihood.
-
-    ``wins[i, j]`` is how often arm i was chosen over arm j. The strengths are in log-odds and have the mean
-    0: arm i is chosen over arm j with probability ``expit(s[i] - s[j])``. They exist only if
-    :func:`is_ranked` says so.
-    """
-
-    def loss(strengths: Float[np.ndarray, "k"]) -> tuple[float, Float[np.ndarray, "k"]]:
-        """Return the negative log-likelihood and its gradient."""
-        apart = strengths[:, None] - strengths[None, :]
-        return -float((wins * log_expit(apart)).sum()), ((wins + wins.T) * expit(apart) - wins).sum(1)
-
-    found = minimize(
-        loss,
-        np.zeros(len(wins)),
-        jac=True,
-        hess=lambda strengths: _information(wins, strengths),
-        method="trust-exact",
-        options={"gtol": TOLERANCE * wins.sum()},
-    )
-    return found.x - found.x.mean()
-
-
-def _information(
-    wins: Float[np.ndarray, "k k"], strengths: Float[np.ndarray, "k"]
-) -> Float[np.ndarray, "k k"]:
-    """Return the negative Hessian of the log-likelihood, whose null space is a shift of all strengths."""
-    chance = expit(strengths[:, None] - strengths[None, :])
-    weights = (wins + wins.T) * chance * (1 - chance)
-    return np.diag(weights.sum(1)) - weights
-
-
-def strength_margins(
-    chosen: Int[np.ndarray, "n"],
-    other: Int[np.ndarray, "n"],
-    clusters: Clusters,
-    strengths: Float[np.ndarray, "k"],
-) -> Float[np.ndarray, "k"]:
-    """Return half the width of the 95 % interval of each strength, measured from the mean of all arms.
-
-    ``chosen`` and ``other`` are the positions of the arms that won and lost each answer. For two arms, the
-    interval of the difference of their strengths comes from :func:`rate_interval`, in log-odds.
-    """
-    inverse = np.linalg.pinv(_information(count_wins(chosen, other, len(strengths)), strengths))
-    surprise = expit(strengths[other] - strengths[chosen])
-    return np.array([margin(surprise * (row[chosen] - row[other]), clusters) for row in inverse])
-
-
-def count_wins(
-    chosen: Int[np.ndarray, "n"], other: Int[np.ndarray, "n"], arms: int
-) -> Float[np.ndarray, "k k"]:
-    """Return how often each of ``arms`` arms (row) was chosen over each other one (column)."""
-    return np.bincount(chosen * arms + other, minlength=arms * arms).reshape(arms, arms).astype(float)
-
-
-def is_ranked(wins: Float[np.ndarray, "k k"]) -> bool:
-    """Return whether finite strengths of the arms exist.
-
-    They exist exactly if the arms cannot be divided into two groups of which one never wins against the other
-    (Ford, 1957).
-    """
-    return connected_components(wins > 0, connection="strong", return_labels=False) == 1

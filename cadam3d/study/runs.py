@@ -4,8 +4,8 @@ An *arm* is what is compared, such as a densifier. Two runs of different arms ar
 prompt and agree in everything else that varies, such as the seed or the objective.
 """
 
-from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Hashable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -125,22 +125,19 @@ def draw_pairs(pairs: Sequence[RunPair], most: int | None, generator: Random) ->
     """
     if most is None or most >= len(pairs):
         return list(pairs)
-    queues: dict[tuple[str, str], list[RunPair]] = defaultdict(list)
-    for pair in generator.sample(list(pairs), len(pairs)):
-        queues[pair.arms].append(pair)
-    ordered = [_prompts_first(queues[arms]) for arms in sorted(queues)]
-    rounds = [queue[i] for i in range(max(map(len, ordered))) for queue in ordered if i < len(queue)]
-    chosen = set(rounds[:most])
+    drawn = generator.sample(list(pairs), len(pairs))
+    prompts_first = _spread(drawn, lambda pair: (pair.arms, pair.prompt))
+    chosen = set(_spread(prompts_first, lambda pair: pair.arms)[:most])
     return [pair for pair in pairs if pair in chosen]
 
 
-def _prompts_first(pairs: Sequence[RunPair]) -> list[RunPair]:
-    """Return the pairs with the first one of every prompt in front, then the second ones, and so on."""
-    seen: dict[str, int] = defaultdict(int)
+def _spread(pairs: Sequence[RunPair], kind: Callable[[RunPair], Hashable]) -> list[RunPair]:
+    """Return the pairs with the first one of every kind in front, then the second ones, and so on."""
+    seen = Counter()
     turns = []
     for pair in pairs:
-        turns.append(seen[pair.prompt])
-        seen[pair.prompt] += 1
+        turns.append(seen[kind(pair)])
+        seen[kind(pair)] += 1
     return [pair for _, pair in sorted(zip(turns, pairs, strict=True), key=lambda item: item[0])]
 
 

@@ -23,7 +23,7 @@ READING = (
 
 
 def markdown(analysis: Analysis) -> str:
-    """Return the result of a study: its size, excluded raters, rates, strengths and pairs."""
+    """Return the result of a study: its size, excluded raters, rates and pairs."""
     sizes = (analysis.raters, "raters"), (analysis.prompts, "prompts"), (analysis.answers, "answers")
     parts = [
         "# User study",
@@ -31,14 +31,10 @@ def markdown(analysis: Analysis) -> str:
         bullets(screening_lines(analysis)),
         "How often each arm was chosen, in % of its comparisons (95 % interval over raters and prompts):",
         _rates(analysis),
+        "How often the first arm of each pair was chosen:",
+        _pairs(analysis),
+        READING,
     ]
-    if len(analysis.arms) > 2:
-        title = (
-            "Probability of being chosen over an arm of average strength, in % (Bradley-Terry model). "
-            "Questions whose answers do not determine it are left out:"
-        )
-        parts += [title, _strengths(analysis)]
-    parts += ["How often the first arm of each pair was chosen:", _pairs(analysis), READING]
     return "\n\n".join(parts) + "\n"
 
 
@@ -70,15 +66,6 @@ def _rates(analysis: Analysis) -> str:
     rows = [[arm, *(cell(question, arm) for question in QUESTIONS)] for arm in analysis.arms]
     rows += [[f"{arm} (published)", *(f"{rate:.1f}" for rate in rates)] for arm, rates in PUBLISHED.items()]
     return _table(["arm", *(question.short for question in QUESTIONS)], rows)
-
-
-def _strengths(analysis: Analysis) -> str:
-    rows = [
-        [result.question, each.arm, _percent(each.preferred), _range(each.interval)]
-        for result in analysis.questions
-        for each in result.strengths or ()
-    ]
-    return _table(["question", "arm", "%", "95 % interval"], rows)
 
 
 def _pairs(analysis: Analysis) -> str:

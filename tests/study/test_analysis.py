@@ -123,15 +123,6 @@ def test_p_values_are_corrected_for_all_comparisons_of_the_study():
     assert pair.corrected_p_value == pair.p_value
 
 
-def test_of_three_arms_the_strengths_have_the_known_order():
-    for result in analyse(simulated_raters(THREE, 20, 10), least_caught=0.8).questions:
-        assert [each.arm for each in result.strengths] == ["a", "b", "c"]
-        assert sum(each.log_odds for each in result.strengths) == pytest.approx(0, abs=1e-9)
-        for each in result.strengths:
-            assert each.interval.low < each.preferred < each.interval.high
-        assert len(result.comparisons) == 3
-
-
 def test_the_rates_of_a_pair_ignore_answers_about_other_arms():
     three = simulated_raters(THREE, 6, 5, questions=["overall"])
     two = [
@@ -140,20 +131,6 @@ def test_the_rates_of_a_pair_ignore_answers_about_other_arms():
     ]
     [of_three], [of_two] = (analyse(each, least_caught=0.8).questions for each in (three, two))
     assert of_three.comparisons[0].rate == of_two.comparisons[0].rate
-    assert of_two.strengths is None
-
-
-@pytest.mark.parametrize(
-    "won",
-    [
-        [("a", "b"), ("a", "c"), ("b", "c"), ("c", "b")],
-        [("a", "b"), ("b", "a"), ("c", "d"), ("d", "c")],
-    ],
-)
-def test_answers_that_do_not_determine_strengths_have_rates_only(won):
-    [result] = analyse([rater("one", *won), rater("two", *won)], least_caught=0.8).questions
-    assert result.strengths == ()
-    assert result.rates
 
 
 def test_arms_that_were_never_compared_have_no_comparison():

@@ -1,6 +1,5 @@
-"""Intervals, tests and the Bradley-Terry model: laws, exact values, and choix as an oracle."""
+"""Intervals and tests: laws and exact values."""
 
-import choix
 import numpy as np
 import pytest
 from scipy.special import expit, logit
@@ -8,14 +7,10 @@ from scipy.stats import binomtest, t
 
 from cadam3d.study.estimates import (
     Clusters,
-    count_wins,
-    fit_strengths,
     holm,
-    is_ranked,
     margin,
     rate_interval,
     sign_test,
-    strength_margins,
 )
 
 
@@ -121,47 +116,3 @@ def test_the_correction_of_holm_has_the_values_of_its_definition():
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([0.9, 0.6]) == [1, 1]
     assert holm([]) == []
-
-
-@pytest.mark.parametrize("arms", [2, 3, 6])
-def test_strengths_are_those_of_choix(arms):
-    generator = np.random.default_rng(arms)
-    true = generator.normal(size=arms)
-    pairs = []
-    while not is_ranked(count_wins(*(np.array(pairs, dtype=int).reshape(-1, 2).T), arms)):
-        i, j = generator.choice(arms, 2, replace=False)
-        pairs.append((i, j) if generator.random() < expit(true[i] - true[j]) else (j, i))
-    expected = choix.ilsr_pairwise(arms, [(int(i), int(j)) for i, j in pairs], alpha=0)
-    found = fit_strengths(count_wins(*np.array(pairs).T, arms))
-    assert found == pytest.approx(expected - expected.mean(), abs=1e-6)
-    assert found.mean() == pytest.approx(0, abs=1e-12)
-
-
-def test_strengths_exist_for_very_uneven_wins():
-    wins = np.array([[0, 10_000, 3], [1, 0, 10_000], [0, 1, 0]], dtype=float)
-    strengths = fit_strengths(wins)
-    expected = (wins + wins.T) * expit(strengths[:, None] - strengths[None, :])
-    assert expected.sum(1) == pytest.approx(wins.sum(1), rel=1e-6)
-
-
-def test_of_two_arms_the_interval_of_the_strength_is_that_of_the_rate():
-    chosen, clusters = drawn(9, 7)
-    winner, loser = np.where(chosen, 0, 1), np.where(chosen, 1, 0)
-    strengths = fit_strengths(count_wins(winner, loser, 2))
-    half = strength_margins(winner, loser, clusters, strengths)
-    # A strength is half of the difference.
-    assert expit(2 * (strengths - half)[0]) == pytest.approx(rate_interval(chosen, clusters).low)
-    assert expit(2 * (strengths + half)[0]) == pytest.approx(rate_interval(chosen, clusters).high)
-
-
-@pytest.mark.parametrize(
-    ("wins", "are_finite"),
-    [
-        ([[0, 1, 0], [0, 0, 1], [1, 0, 0]], True),
-        ([[0, 1, 1], [1, 0, 1], [0, 0, 0]], False),
-        ([[0, 0, 0], [1, 0, 1], [1, 1, 0]], False),
-        ([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, 1, 0]], False),
-    ],
-)
-def test_arms_without_finite_strengths_are_found(wins, are_finite):
-    assert is_ranked(np.array(wins, dtype=float)) == are_finite
