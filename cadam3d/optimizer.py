@@ -12,7 +12,7 @@ from torch import Tensor
 from cadam3d.core.checks import require_range, unless_none
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import FIELDS, Gaussians
-from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled, settled_at
+from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 
 # The tensors as Adam groups them: view-dependent colours are separate, because they learn more slowly.
 PARTS = ("means", "sh_dc", "sh_rest", "opacity", "scale", "quat")
@@ -51,10 +51,6 @@ class AdamSettings:
     def learning_rates(self, step: int) -> dict[str, float]:
         """Return the rate of each part at ``step`` (0 is the first)."""
         return {part: float(as_schedule(getattr(self, f"{part}_lr"))(step)) for part in PARTS}
-
-    def settled_at(self) -> int:
-        """Return the first step from which no learning rate changes; 0 if all are constant."""
-        return max(settled_at(getattr(self, f"{part}_lr")) for part in PARTS)
 
     def largest_norm(self, part: str, step: int) -> float | None:
         """Return the bound of a part at ``step`` (0 is the first); None if gradients are not clipped.

@@ -73,6 +73,26 @@ def run_context(prompt: str, trainer: Trainer, state: TrainState, folder: Path) 
     )
 
 
+def describe_schedule(trainer: Trainer) -> str:
+    """Return the refinements and opacity resets of a run in one line, and whether anything will grow."""
+    refine, densifier = trainer.refine, trainer.densifier
+    resets = refine.resets if densifier.resets else range(0)
+    parts = [_counted("refinement", refine.refinements), _counted("opacity reset", resets)]
+    parts += ["a last pruning"] if refine.last_max_scale is not None else []
+    text = f"{', '.join(parts)}."
+    first = densifier.grows_from
+    if first is not None and not any(step >= first for step in refine.refinements[-1:]):
+        text += f" Nothing will grow before step {first}. Try: refine.start=0 refine.end={refine.steps}"
+    return text
+
+
+def _counted(noun: str, steps: range) -> str:
+    """Return a number of events and their steps, such as "2 resets (steps 300 to 450, every 150)"."""
+    if len(steps) < 2:
+        return f"1 {noun} (step {steps[0]})" if steps else f"no {noun}"
+    return f"{len(steps)} {noun}s (steps {steps[0]} to {steps[-1]}, every {steps.step})"
+
+
 @contextmanager
 def begun(cfg: DictConfig, call: Call, folder: Path) -> Iterator[str]:
     """Write the settings into the folder of a run, and its log while the block runs; yield the settings.

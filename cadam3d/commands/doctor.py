@@ -1,43 +1,67 @@
 """``cadam3d doctor``: check this machine, and print what to type if something is missing or broken."""
 
 import json
-import os
 import platform
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
-from dataclasses import asdict
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from enum import StrEnum
 from functools import partial
 from importlib import import_module, metadata
-from pathlib import Path
 
+import imageio_ffmpeg
+import torch
 from omegaconf import DictConfig
 
 from cadam3d import __version__
 from cadam3d.build import component
-from cadam3d.commands.finding import Finding, Verdict, attempt
+from cadam3d.compiled import library
+from cadam3d.core.cameras import turntable
+from cadam3d.core.errors import UserError
+from cadam3d.prior.shapes.native_tracer import load_tracer, trace_natively
+from cadam3d.prior.shapes.scene import build as scene_of
+from cadam3d.prior.shapes.tracer import trace
+from cadam3d.rasterizer import nvrtc
+from cadam3d.rasterizer.auto import AutoRasterizer
+from cadam3d.rasterizer.base import Rasterizer
+from cadam3d.rasterizer.cpu import CpuRasterizer
+from cadam3d.rasterizer.cuda import CudaRasterizer
+from cadam3d.rasterizer.gsplat import GsplatRasterizer
+from cadam3d.rasterizer.reference import ReferenceRasterizer
+from cadam3d.rasterizer.selftest import ATOMIC, GSPLAT, OWN, Demands, self_test
 from cadam3d.settings.compose import Call, compose
 from cadam3d.settings.options import config_dir, option_names
 
-PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "fast-simplification", "imageio", "imageio-ffmpeg")
-PACKAGES += (
-    "jaxtyping",
-    "jinja2",
-    "kornia",
-    "matplotlib",
-    "pillow",
-    "pydantic",
-    "pyyaml",
-    "scikit-image",
-    "scipy",
-)
-PACKAGES += ("tqdm", "trimesh")
-IMPORT_NAMES = {"hydra-core": "hydra", "imageio-ffmpeg": "imageio_ffmpeg", "pillow": "PIL", "pyyaml": "yaml"}
-IMPORT_NAMES |= {"fast-simplification": "fast_simplification", "scikit-image": "skimage"}
-COMPILERS = ("c++", "g++", "clang++", "nvcc")
-SECONDS = 60  # longest wait for a program
+# The packages that are imported under another name.
+IMPORT_NAMES = {"hydra-core": "hydra", "pillow": "PIL", "pyyaml": "yaml", "scikit-image": "skimage"}
+CPU = torch.device("cpu")
+# Several kinds of solids. There is no pattern, because its borders may differ by a sample.
+PROMPT = "a red mug next to a tree"
+TOLERANCE = 1e-4  # of the light, in [0, 1]
+# Failures that do not end a training, because auto chooses another backend then.
+REPLACED = ("rasterizer=cuda", "rasterizer=gsplat")
+REPORT = "Please report this. Until it is fixed, use {}"
+
+
+class Verdict(StrEnum):
+    """The meaning of a finding for training."""
+
+    OK = "ok"
+    NOTE = "note"  # not available, and not needed by default
+    BROKEN = "broken"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report."""
+
+    topic: str
+    verdict: Verdict
+    found: str
+    hint: str = ""  # what to type; empty if nothing is wrong
 
 
 def run(cfg: DictConfig, _call: Call) -> None:
@@ -58,35 +82,45 @@ def run(cfg: DictConfig, _call: Call) -> None:
 
 def examine() -> Iterator[Finding]:
     """Run all checks. A check that fails does not stop the following ones."""
-    yield _python()
-    yield from map(_package, PACKAGES)
-    for topic, check in (
-        ("torchvision", _torchvision),
-        ("device", _device),
-        ("ffmpeg", _ffmpeg),
-        ("configs", _configs),
-    ):
-        yield attempt(topic, check, is_needed=True)
-    yield from map(_compiler, COMPILERS)
-    yield from _kernels()
+    system = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
+    yield Finding("python", Verdict.OK, f"{system}, cadam3d {__version__}")
+    yield from map(check_package, dependencies())
+    yield attempt("device", check_device, is_needed=True)
+    yield attempt("ffmpeg", check_ffmpeg, is_needed=True)
+    yield attempt("configs", check_configs, is_needed=True)
+    yield check_compilers()
+    yield from check_rasterizers()
+    yield attempt("prior.tracer=auto", check_tracer)
     for name in option_names("prior"):
-        yield attempt(f"prior={name}", partial(_prior, f"prior={name}"))
-    yield from (_diffusers(), _models())
+        yield attempt(f"prior={name}", partial(check_prior, name))
 
 
-def _python() -> Finding:
-    version = platform.python_version()
-    found = f"{version} on {platform.system()} {platform.machine()}, cadam3d {__version__}"
-    if (3, 11) <= sys.version_info[:2] <= (3, 13):
-        return Finding("python", Verdict.OK, found)
-    return Finding(
-        "python", Verdict.BROKEN, found, "Expected 3.11 to 3.13. Try: make clean demo PYTHON=python3.12"
-    )
+def attempt(topic: str, check: Callable[[], Finding], *, is_needed: bool = False) -> Finding:
+    """Return the finding of ``check``, or one about the error that it raises.
 
-
-def _package(name: str) -> Finding:
+    The error is a note if something is not available that training does not need.
+    """
     try:
-        import_module(IMPORT_NAMES.get(name, name))
+        return check()
+    except Exception as error:
+        is_note = isinstance(error, UserError | ImportError | OSError) and not is_needed
+        first, *others = str(error).splitlines() or [type(error).__name__]
+        if is_note:
+            return Finding(topic, Verdict.NOTE, first, others[-1] if others else "")
+        hint = "Try: pip install --upgrade --force-reinstall ."
+        return Finding(topic, Verdict.BROKEN, f"{type(error).__name__}: {first}", hint)
+
+
+def dependencies() -> list[str]:
+    """Return the names of the packages that cadam3d needs without extras."""
+    lines = [line for line in metadata.requires("cadam3d") or () if "extra ==" not in line]
+    return [re.split(r"[^\w-]", line)[0] for line in lines]
+
+
+def check_package(name: str) -> Finding:
+    """Import a package."""
+    try:
+        import_module(IMPORT_NAMES.get(name, name.replace("-", "_")))
         return Finding(name, Verdict.OK, metadata.version(name))
     except Exception as error:
         # The code of a package may raise anything when it is imported.
@@ -94,106 +128,102 @@ def _package(name: str) -> Finding:
         return Finding(name, Verdict.BROKEN, reason, f"Try: pip install --force-reinstall {name}")
 
 
-def _torchvision() -> Finding:
-    """Check that torchvision fits torch. Otherwise diffusers and other packages that import it fail."""
-    try:
-        version = metadata.version("torchvision")
-    except metadata.PackageNotFoundError:
-        return Finding("torchvision", Verdict.OK, "not installed, not needed")
-    code, output = _run_program([sys.executable, "-P", "-c", "import torchvision"])
-    if code == 0:
-        return Finding("torchvision", Verdict.OK, version)
-    reason = output.strip().splitlines()[-1] if output.strip() else "does not import"
-    found = f"{version} does not fit torch: {reason}"
-    return Finding("torchvision", Verdict.BROKEN, found, "Try: pip uninstall torchvision")
-
-
-def _device() -> Finding:
-    import torch
-
+def check_device() -> Finding:
+    """Name the device that trains. A GPU that torch cannot use is a note."""
     if torch.cuda.is_available():
         properties = torch.cuda.get_device_properties(0)
         memory = properties.total_memory / 2**30
         return Finding(
             "device", Verdict.OK, f"{properties.name}, {memory:.0f} GiB, CUDA {torch.version.cuda}"
         )
-    found = f"CPU, {torch.get_num_threads()} threads"
-    if shutil.which("nvidia-smi") and _run_program(["nvidia-smi", "-L"])[0] == 0:
+    found, command = f"CPU, {torch.get_num_threads()} threads", ["nvidia-smi", "-L"]
+    if shutil.which(command[0]) and subprocess.run(command, capture_output=True, check=False).returncode == 0:
         hint = "Try: pip install --force-reinstall torch, with the CUDA version of your driver"
         return Finding("device", Verdict.NOTE, f"{found}; torch cannot use the GPU", hint)
     return Finding("device", Verdict.OK, found)
 
 
-def _ffmpeg() -> Finding:
-    import imageio_ffmpeg
-
-    path = imageio_ffmpeg.get_ffmpeg_exe()
-    code, output = _run_program([path, "-version"])
-    version = re.search(r"version (\S+)", output)
-    if code == 0 and version:
-        return Finding("ffmpeg", Verdict.OK, f"{version.group(1)}, {path}")
-    hint = "Try: pip install --force-reinstall imageio-ffmpeg"
-    return Finding("ffmpeg", Verdict.BROKEN, f"{path} does not run", hint)
+def check_ffmpeg() -> Finding:
+    """Run ffmpeg."""
+    version = imageio_ffmpeg.get_ffmpeg_version()
+    return Finding("ffmpeg", Verdict.OK, f"{version}, {imageio_ffmpeg.get_ffmpeg_exe()}")
 
 
-def _configs() -> Finding:
-    folder = config_dir()
+def check_configs() -> Finding:
+    """Compose the default settings."""
     cfg = compose(["prompt=test"])
-    return Finding("configs", Verdict.OK, f"{folder}, {len(cfg)} settings and groups")
+    return Finding("configs", Verdict.OK, f"{config_dir()}, {len(cfg)} settings and groups")
 
 
-def _compiler(name: str) -> Finding:
-    path = shutil.which(name)
-    if path is None:
-        return Finding(name, Verdict.NOTE, "not found; one C++ compiler is enough, and nvcc is not needed")
-    code, output = _run_program([path, "--version"])
-    if code != 0:
-        return Finding(name, Verdict.NOTE, f"{path} does not run")
-    lines = output.strip().splitlines() or [path]
-    # nvcc prints its version on the fourth line.
-    release = [line for line in lines if "release" in line]
-    return Finding(name, Verdict.OK, (release or lines)[0].strip())
+def check_compilers() -> Finding:
+    """Name the compilers of the kernels: a C++ compiler, and NVRTC for a GPU."""
+    native, nvidia = library.find_compiler(), nvrtc.find_compiler()
+    found = [native.version] if native else []
+    found += ["NVRTC {}.{}".format(*nvidia.version)] if nvidia else []
+    return Finding("compilers", Verdict.OK if found else Verdict.NOTE, ", ".join(found) or "none")
 
 
-def _kernels() -> Iterator[Finding]:
-    try:
-        from cadam3d.commands.doctor_kernels import check_kernels
-    except Exception as error:
-        # For example, torch cannot be imported. The check of that package has reported it already.
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        yield Finding("rasterizers", Verdict.BROKEN, f"cannot be loaded: {reason}")
-        return
-    yield from check_kernels()
+def check_rasterizers() -> Iterator[Finding]:
+    """Compile and test each backend on each device. ``auto`` is last because it would compile silently."""
+    devices = [CPU, *(torch.device("cuda", i) for i in range(torch.cuda.device_count()))]
+    for device in devices:
+        is_cpu = device == CPU
+        tests: list[tuple[str, Rasterizer, Demands]] = [
+            ("reference", ReferenceRasterizer(), OWN if is_cpu else ATOMIC)
+        ]
+        if is_cpu:
+            tests += [("cpu", CpuRasterizer(cache_dir=None), OWN)]
+        else:
+            tests += [
+                ("cuda", CudaRasterizer(cache_dir=None), OWN),
+                ("gsplat", GsplatRasterizer(), GSPLAT),
+            ]
+        for name, rasterizer, demands in tests:
+            topic = f"rasterizer={name}"
+            yield attempt(topic, partial(check_rasterizer, topic, rasterizer, device, demands))
+    for device in devices:
+        yield attempt("rasterizer=auto", partial(check_choice, device))
 
 
-def _prior(topic: str) -> Finding:
+def check_rasterizer(topic: str, rasterizer: Rasterizer, device: torch.device, demands: Demands) -> Finding:
+    """Compile a backend and compare it with the reference. Raises ``UserError`` if it is not available."""
+    rasterizer.prepare(device)
+    agreement = self_test(rasterizer, device, demands)
+    found = f"{agreement}, on {device}"
+    if agreement.passes:
+        return Finding(topic, Verdict.OK, found)
+    verdict = Verdict.NOTE if topic in REPLACED else Verdict.BROKEN
+    return Finding(topic, verdict, found, REPORT.format("rasterizer=reference"))
+
+
+def check_choice(device: torch.device) -> Finding:
+    """Name the backend that ``auto`` chooses."""
+    backend = AutoRasterizer().prepare(device)
+    chosen = f"chooses {backend.name} on {device}"
+    if backend.reason is None:
+        return Finding("rasterizer=auto", Verdict.OK, chosen)
+    first, *others = backend.reason.splitlines()
+    return Finding("rasterizer=auto", Verdict.NOTE, f"{chosen}: {first}", *others[-1:])
+
+
+def check_tracer() -> Finding:
+    """Compile the native tracer and compare it with the one in torch."""
+    topic = "prior.tracer=auto"
+    _, tracer = load_tracer()
+    scene = scene_of(PROMPT).to(CPU, torch.float32)
+    views = turntable(2, elevation_deg=20.0, distance=3.0, fov_y_deg=40.0, size=32)
+    ours, expected = trace_natively(tracer, scene, views, 2), trace(scene, views, 2)
+    difference = float((ours.paints - expected.paints).abs().max())
+    if difference <= TOLERANCE:
+        return Finding(topic, Verdict.OK, f"native, equals torch to {difference:.1g}")
+    hint = REPORT.format("prior.tracer=torch")
+    return Finding(topic, Verdict.BROKEN, f"native, differs from torch by {difference:.1g}", hint)
+
+
+def check_prior(name: str) -> Finding:
+    """Build a prior without its weights, and say what it lacks."""
+    topic = f"prior={name}"
     prior = component(compose(["prompt=test", topic]).prior)
     if (lack := prior.lacks()) is not None:
         return Finding(topic, Verdict.NOTE, lack)
     return Finding(topic, Verdict.OK, (prior.notice() or "ready").splitlines()[0])
-
-
-def _diffusers() -> Finding:
-    try:
-        return Finding("diffusers", Verdict.OK, metadata.version("diffusers"))
-    except metadata.PackageNotFoundError:
-        return Finding("diffusers", Verdict.NOTE, "not installed; only priors that are networks need it")
-
-
-def _models() -> Finding:
-    """List the models in the cache of the Hugging Face hub."""
-    home = Path(os.environ.get("HF_HOME") or Path("~/.cache/huggingface").expanduser())
-    cache = Path(os.environ.get("HF_HUB_CACHE") or home / "hub")
-    names = [folder.name.split("--", 1)[1].replace("--", "/") for folder in sorted(cache.glob("models--*"))]
-    if not names:
-        return Finding("models on disk", Verdict.NOTE, f"none in {cache}; prior=shapes needs none")
-    return Finding("models on disk", Verdict.OK, ", ".join(names))
-
-
-def _run_program(command: list[str]) -> tuple[int, str]:
-    """Return the exit code and output of a program; code 127 if it cannot be run or does not end in time."""
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS, check=False)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        return 127, str(error)
-    return done.returncode, done.stdout + done.stderr

@@ -11,11 +11,17 @@ from omegaconf import DictConfig
 
 from cadam3d.build import build_trainer, component
 from cadam3d.callback.base import Callback
-from cadam3d.commands.beginning import begun, deterministic, load_prior, note_memory, run_context
+from cadam3d.commands.beginning import (
+    begun,
+    describe_schedule,
+    deterministic,
+    load_prior,
+    note_memory,
+    run_context,
+)
 from cadam3d.commands.control import Control, StopOnSignal
 from cadam3d.commands.finishing import Results, measure_memory, print_result, summarize
 from cadam3d.commands.resuming import keep_start, start_or_resume
-from cadam3d.commands.timetable import describe
 from cadam3d.core.checks import require_whole
 from cadam3d.core.console import say
 from cadam3d.core.device import resolve_device
@@ -62,12 +68,12 @@ def optimise(
         state = start_or_resume(cfg, trainer, initializer, device, folder)
         start = keep_start(cfg, state, initializer, device) if results.measures_start else None
         load_prior(trainer, state, backend)
-        timetable = describe(trainer)
-        say(f"Schedule: {timetable}")
+        schedule = describe_schedule(trainer)
+        say(f"Schedule: {schedule}")
 
         with begun(cfg, call, folder) as config_text:
             log.info("prompt %r, seed %d, on %s, from step %d", cfg.prompt, cfg.seed, device, state.step)
-            log.info("schedule: %s", timetable)
+            log.info("schedule: %s", schedule)
             log.info("rasterizer=%s; %s", backend.name, backend.reason or "nothing faster is known here")
             charts = [*trainer.densifier.charts(), *trainer.guidance.charts()]
             write_declarations(folder, charts)
@@ -76,7 +82,7 @@ def optimise(
                 outcome = trainer.train(state, embedding, context, control)
                 log.info("%s after %d steps: %d Gaussians", outcome, state.step, len(state.gaussians))
                 summary = summarize(cfg, call.choices, state, outcome, backend)
-                summary |= memory | measure_memory(device) | {"schedule": timetable}
+                summary |= memory | measure_memory(device) | {"schedule": schedule}
                 summary["grows"] = trainer.densifier.grows_from is not None
                 results.write(context, state.gaussians.detach(), start, summary)
                 for callback in trainer.callbacks:

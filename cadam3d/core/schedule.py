@@ -6,7 +6,6 @@
 import math
 import sys
 from abc import ABC, abstractmethod
-from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -109,13 +108,6 @@ class Steps(Schedule):
 def as_schedule(value: float | Schedule) -> Schedule:
     """Return ``value`` as a schedule; a plain number becomes a constant one."""
     return value if isinstance(value, Schedule) else Constant(float(value))
-
-
-def settled_at(value: float | Schedule) -> int:
-    """Return the first step from which ``value`` no longer changes; 0 for a number."""
-    schedule = as_schedule(value)
-    final = schedule(FAR_STEP)
-    return bisect_left(range(FAR_STEP), True, key=lambda step: schedule(step) == final)
 
 
 def require_scheduled(key: str, value: object, **bounds: float) -> None:

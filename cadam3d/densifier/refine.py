@@ -41,7 +41,6 @@ class Refine:
     """
 
     steps: int  # of the run
-    made_for: int | None  # steps of the run for which the schedule is made
     start: int  # step
     end: int  # step
     interval: int  # steps, the paper's K
@@ -62,7 +61,6 @@ class Refine:
 
     def __post_init__(self) -> None:
         require_whole("refine.steps", self.steps, low=1, high=FAR_STEP)
-        unless_none(require_whole, "refine.made_for", self.made_for, low=1, high=FAR_STEP)
         require_whole("refine.start", self.start, low=0)
         require_whole("refine.end", self.end, low=0)
         require_whole("refine.interval", self.interval, low=1)
@@ -116,18 +114,10 @@ class Refine:
         step, so the way from 0.01 back to 0.5 takes 92 steps at the usual rate of 0.05 (``reset_value``,
         ``optimizer.opacity_lr``). A reset in the last steps of a run would therefore spoil the result.
         """
-        return self._due_resets(1, self.steps - self.recovery)
-
-    @property
-    def skipped_resets(self) -> range:
-        """Return the steps of the resets that are due but would leave fewer than ``recovery`` steps."""
-        return self._due_resets(max(1, self.steps - self.recovery + 1), self.steps)
-
-    def _due_resets(self, first: int, last: int) -> range:
-        """Return the steps in ``[first, last]`` at which the schedule has resets, whatever the length."""
         if self.reset_interval is None:
             return range(0)
-        return _multiples(self.reset_interval, max(first, self.reset_from), min(last, self.reset_until - 1))
+        last = min(self.steps - self.recovery, self.reset_until - 1)
+        return _multiples(self.reset_interval, max(1, self.reset_from), last)
 
     def refines_at(self, step: int) -> bool:
         """Return whether step number ``step`` (from 1) ends with a refinement."""

@@ -1,98 +1,174 @@
 """``cadam3d doctor`` checks the machine, prints hints, and fails only if training would fail."""
 
 import json
-import re
+import math
 import sys
-import tomllib
-from pathlib import Path
+from dataclasses import replace
 
 import pytest
+import torch
 
 from cadam3d.commands import doctor
-from cadam3d.commands.finding import Finding, Verdict, attempt
+from cadam3d.commands.doctor import Finding, Verdict, attempt
+from cadam3d.compiled import library
+from cadam3d.rasterizer import auto, gsplat, nvrtc
+from cadam3d.rasterizer.base import Backend, Rasterizer
+from cadam3d.rasterizer.cpu import load_kernels
+from cadam3d.rasterizer.reference import ReferenceRasterizer
+from cadam3d.rasterizer.selftest import ATOMIC, GSPLAT, OWN, self_test
+from cadam3d.settings.options import option_names
 
-REPOSITORY = Path(__file__).parent.parent.parent
+needs_compiler = pytest.mark.skipif(library.find_compiler() is None, reason="no C++ compiler")
 
 
 @pytest.fixture(scope="module")
 def findings():
-    return {finding.topic: finding for finding in doctor.examine()}
+    # The imports behind some priors take many seconds.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(doctor, "check_prior", lambda name: Finding(f"prior={name}", Verdict.OK, "ready"))
+        return {finding.topic: finding for finding in doctor.examine()}
 
 
-def test_this_machine_can_train(findings):
+@pytest.fixture(scope="module")
+def agreement():
+    return self_test(ReferenceRasterizer(), torch.device("cpu"))
+
+
+@pytest.fixture
+def bare(monkeypatch, tmp_path):
+    """Simulate a machine without compilers, compiled kernels and GPUs."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(library, "find_compiler", lambda: None)
+    monkeypatch.setattr(nvrtc, "find_compiler", lambda: None)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    for cached in (auto._choose, load_kernels):
+        cached.cache_clear()
+    yield
+    for cached in (auto._choose, load_kernels):
+        cached.cache_clear()
+
+
+def test_this_machine_can_train_and_everything_is_examined(findings):
     assert not [finding for finding in findings.values() if finding.verdict is Verdict.BROKEN]
-
-
-@pytest.mark.parametrize(
-    "topic", ["python", "torch", "device", "ffmpeg", "configs", "c++", "nvcc", "diffusers"]
-)
-def test_doctor_reports_on(topic, findings):
-    assert findings[topic].found
-
-
-def test_every_rasterizer_that_this_machine_supports_is_tested(findings):
+    assert {"python", "torch", "device", "ffmpeg", "configs", "compilers", "rasterizer=cpu"} <= set(findings)
     assert findings["rasterizer=reference"].verdict is Verdict.OK
     assert findings["rasterizer=auto"].found.startswith("chooses ")
-    assert "kernels for cpu" in findings
-    assert "kernels for cuda" in findings
+    for name in option_names("prior"):
+        assert f"prior={name}" in findings
+    assert doctor.check_prior("shapes").verdict is Verdict.OK
 
 
-def test_every_prior_is_checked(findings):
-    for path in (REPOSITORY / "configs" / "prior").glob("*.yaml"):
-        assert f"prior={path.stem}" in findings
-    assert findings["prior=shapes"].verdict is Verdict.OK
-
-
-def test_rasterizers_that_cannot_be_imported_are_one_finding(monkeypatch):
-    monkeypatch.setitem(sys.modules, "cadam3d.commands.doctor_kernels", None)
-    [finding] = doctor._kernels()
-    assert finding.verdict is Verdict.BROKEN
-    assert "cadam3d.commands.doctor_kernels" in finding.found
-
-
-def test_every_dependency_is_checked():
-    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    declared = {re.match(r"[\w-]+", line).group() for line in project["dependencies"]}
-    assert set(doctor.PACKAGES) == declared
+@needs_compiler
+def test_the_native_kernels_agree_with_the_reference(findings):
+    assert findings["compilers"].found.startswith(library.find_compiler().version)
+    assert findings["rasterizer=cpu"].found.startswith("agrees with the reference: images ")
+    assert findings["prior.tracer=auto"].verdict is Verdict.OK
 
 
 def test_a_package_that_does_not_import_is_broken_and_has_a_hint(monkeypatch):
     monkeypatch.setitem(sys.modules, "tqdm", None)
-    finding = doctor._package("tqdm")
+    finding = doctor.check_package("tqdm")
     assert finding.verdict is Verdict.BROKEN
     assert finding.hint == "Try: pip install --force-reinstall tqdm"
 
 
-def test_a_torchvision_that_does_not_fit_torch_is_broken(monkeypatch):
-    monkeypatch.setattr(doctor.metadata, "version", lambda name: "0.28.0")
-    output = "Traceback ...\nRuntimeError: operator torchvision::nms does not exist"
-    monkeypatch.setattr(doctor, "_run_program", lambda command: (1, output))
-    finding = doctor._torchvision()
-    assert finding.verdict is Verdict.BROKEN
-    assert "nms does not exist" in finding.found
-    assert finding.hint == "Try: pip uninstall torchvision"
-
-
 def test_no_ffmpeg_is_broken(monkeypatch):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/nowhere/ffmpeg")
-    assert attempt("ffmpeg", doctor._ffmpeg, is_needed=True).verdict is Verdict.BROKEN
+    assert attempt("ffmpeg", doctor.check_ffmpeg, is_needed=True).verdict is Verdict.BROKEN
 
 
-def test_no_compiler_is_only_a_note():
-    assert doctor._compiler("no-such-compiler").verdict is Verdict.NOTE
+def test_a_gpu_that_torch_cannot_use_gets_a_hint(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: "/bin/true")
+    monkeypatch.setattr(doctor.subprocess, "run", lambda command, **_: replace_code(0))
+    finding = doctor.check_device()
+    assert finding.verdict is Verdict.NOTE
+    assert finding.hint.startswith("Try: pip install")
 
 
-def test_models_on_disk_are_listed_by_name(monkeypatch, tmp_path):
-    (tmp_path / "models--someone--some-model").mkdir()
-    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
-    assert doctor._models().found == "someone/some-model"
+def replace_code(code):
+    return doctor.subprocess.CompletedProcess([], code)
 
 
-def test_a_program_that_does_not_end_is_stopped_after_a_while(monkeypatch):
-    monkeypatch.setattr(doctor, "SECONDS", 0.1)
-    code, output = doctor._run_program([sys.executable, "-c", "import time; time.sleep(30)"])
-    assert code == 127
-    assert "timed out" in output
+def test_with_nothing_installed_the_reference_is_tested_and_the_rest_is_named_as_missing(bare):
+    found = {finding.topic: finding for finding in doctor.check_rasterizers()}
+    assert found["rasterizer=reference"].verdict is Verdict.OK
+    assert found["rasterizer=cpu"].verdict is Verdict.NOTE
+    assert "pip install '.[compiler]'" in found["rasterizer=cpu"].found
+    assert found["rasterizer=auto"].found.startswith(
+        "chooses reference on cpu: rasterizer=cpu: expected a C++"
+    )
+    assert attempt("prior.tracer=auto", doctor.check_tracer).verdict is Verdict.NOTE
+    assert doctor.check_compilers().verdict is Verdict.NOTE
+
+
+def test_a_gpu_without_gsplat_gets_the_command_that_installs_it(bare, monkeypatch, agreement):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(doctor.CudaRasterizer, "prepare", lambda self, device: Backend("cuda"))
+    monkeypatch.setattr(doctor.AutoRasterizer, "prepare", lambda self, device: Backend("cuda"))
+    monkeypatch.setattr(gsplat, "find_spec", lambda name: None)
+    monkeypatch.setattr(doctor, "self_test", lambda *_: agreement)
+    found = {finding.topic: finding for finding in doctor.check_rasterizers()}
+    assert found["rasterizer=cuda"].found == f"{agreement}, on cuda:0"
+    assert found["rasterizer=gsplat"].verdict is Verdict.NOTE
+    assert found["rasterizer=gsplat"].found.endswith("Try: pip install '.[gsplat]'")
+
+
+class Prepared(ReferenceRasterizer):
+    """A rasterizer that is ready on every device."""
+
+    def prepare(self, device):
+        """Return a name."""
+        return Backend("prepared")
+
+
+@pytest.mark.parametrize(
+    ("topic", "demands", "change", "verdict"),
+    [
+        ("rasterizer=cpu", OWN, {"gradients": {"means": 0.1}}, Verdict.BROKEN),
+        ("rasterizer=cpu", OWN, {"images": {"rgb": math.inf}}, Verdict.BROKEN),
+        ("rasterizer=cpu", OWN, {"repeats": False}, Verdict.BROKEN),
+        # Without its self-test, auto chooses another backend.
+        ("rasterizer=cuda", OWN, {"repeats": False}, Verdict.NOTE),
+        ("rasterizer=gsplat", GSPLAT, {"repeats": False}, Verdict.OK),
+        ("rasterizer=gsplat", GSPLAT, {"gradients": {"means": 0.1}}, Verdict.NOTE),
+        # On a GPU, the sums of the reference use atomics.
+        ("rasterizer=reference", ATOMIC, {"repeats": False}, Verdict.OK),
+    ],
+)
+def test_a_failed_self_test_is_reported(topic, demands, change, verdict, monkeypatch, agreement):
+    monkeypatch.setattr(doctor, "self_test", lambda *_: replace(agreement, demands=demands, **change))
+    finding = doctor.check_rasterizer(topic, Prepared(), torch.device("cpu"), demands)
+    assert finding.verdict is verdict
+    assert ("report" in finding.hint) is (verdict is not Verdict.OK)
+
+
+def test_a_self_test_that_crashes_is_a_finding():
+    class Crashing(Rasterizer):
+        def render(self, *_):
+            raise RuntimeError("an illegal memory access\nsomewhere")
+
+    finding = attempt(
+        "rasterizer=cuda",
+        lambda: doctor.check_rasterizer("rasterizer=cuda", Crashing(), torch.device("cpu"), OWN),
+    )
+    assert finding.verdict is Verdict.BROKEN
+    assert finding.found == "RuntimeError: an illegal memory access"
+
+
+@needs_compiler
+def test_a_native_tracer_that_draws_something_else_is_broken(monkeypatch):
+    trace = doctor.trace_natively
+
+    def brighter(*case):
+        layers = trace(*case)
+        return replace(layers, paints=1.01 * layers.paints)
+
+    monkeypatch.setattr(doctor, "trace_natively", brighter)
+    finding = doctor.check_tracer()
+    assert finding.verdict is Verdict.BROKEN
+    assert finding.hint.endswith("use prior.tracer=torch")
 
 
 def replace_findings(monkeypatch, *findings: Finding) -> None:
@@ -107,15 +183,8 @@ def test_without_problems_the_exit_code_is_0_and_no_file_is_left(monkeypatch, tm
     assert not list(tmp_path.iterdir())
 
 
-def test_a_broken_finding_prints_its_hint_and_causes_exit_code_1(monkeypatch, type_line):
-    replace_findings(monkeypatch, Finding("torch", Verdict.BROKEN, "gone", "Try: pip install torch"))
-    code, out, _ = type_line("doctor")
-    assert code == 1
-    assert "Try: pip install torch" in out
-
-
 @pytest.mark.parametrize("word", ["json=true", "--json"])
-def test_json_is_one_object_for_other_programs(word, monkeypatch, type_line):
+def test_a_broken_finding_causes_exit_code_1_and_json_is_one_object(word, monkeypatch, type_line):
     replace_findings(monkeypatch, Finding("torch", Verdict.BROKEN, "gone", "hint"))
     code, out, _ = type_line("doctor", word)
     report = json.loads(out)
@@ -123,20 +192,3 @@ def test_json_is_one_object_for_other_programs(word, monkeypatch, type_line):
     assert report["ok"] is False
     [finding] = report["findings"]
     assert finding == {"topic": "torch", "verdict": "broken", "found": "gone", "hint": "hint"}
-
-
-def test_python_that_is_too_old_is_broken(monkeypatch):
-    monkeypatch.setattr(doctor.sys, "version_info", (3, 10, 0))
-    assert doctor._python().verdict is Verdict.BROKEN
-
-
-def test_a_gpu_that_torch_cannot_use_gets_a_hint(monkeypatch):
-    import torch
-
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/usr/bin/{name}")
-    monkeypatch.setattr(doctor, "_run_program", lambda command: (0, "GPU 0"))
-    finding = doctor._device()
-    assert finding.verdict is Verdict.NOTE
-    assert "torch cannot use the GPU" in finding.found
-    assert finding.hint.startswith("Try: pip install")

@@ -155,7 +155,6 @@ def test_the_snr_gate_rejects_strong_but_unsteady_drift():
 def test_growth_is_bounded_by_the_quantile_at_every_call():
     refine = Refine(
         steps=100,
-        made_for=None,
         last_max_scale=None,
         start=0,
         end=100,

@@ -24,7 +24,6 @@ LATE = 10_000  # a step at which nothing is scheduled
 def refine(**changes) -> Refine:
     usual = {
         "steps": 20_000,
-        "made_for": None,
         "last_max_scale": None,
         "start": 100,
         "end": 3000,
@@ -269,7 +268,6 @@ def test_gaussians_moments_and_densifier_state_stay_in_step_through_many_edits(d
     ("key", "value"),
     [
         ("steps", 0),
-        ("made_for", 0),
         ("start", -1),
         ("interval", 0),
         ("tau_scale", 0.0),

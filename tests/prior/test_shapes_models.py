@@ -125,12 +125,12 @@ def test_without_the_extra_the_message_says_what_to_install(name, models, monkey
     monkeypatch.setattr(pretrained, "find_spec", lambda each: None if each == "diffusers" else found(each))
     done = type_line("train", f"prior={name}", "prompt=a red cube")
     assert done.message == "prior: needs diffusers. Try: pip install '.[diffusers]'"
-    assert doctor._prior(f"prior={name}").hint == ""
+    assert doctor.check_prior(name).hint == ""
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_doctor_lists_the_models_of_the_package_as_ready(name, models):
-    finding = doctor._prior(f"prior={name}")
+    finding = doctor.check_prior(name)
     assert (str(finding.verdict), finding.found) == ("ok", "ready")
 
 
