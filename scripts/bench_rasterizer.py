@@ -2,6 +2,7 @@
 
     python scripts/bench_rasterizer.py                  # this CPU: reference and cpu
     python scripts/bench_rasterizer.py --device cuda    # this GPU: cuda, stage by stage, beside gsplat
+    python scripts/bench_rasterizer.py --backends cpu --counts 1000000 --threads 1 2 --no-check
 
 A backend that disagrees with the reference, or with itself from run to run, is not timed. The script prints
 the differences, times the other backends, and ends with exit code 1. Times are medians in milliseconds. The
@@ -10,22 +11,27 @@ docs/notes/performance.md describes the measurement.
 """
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-import torch
-from omegaconf import OmegaConf
-
 # The script measures the package that it stands beside, from any folder.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from cadam3d.core.openmp import waiting
+
+# As on the command line, and before torch is loaded: idle threads of torch leave the processor to others.
+os.environ.update(waiting(os.environ))
+
 import measuring
+import torch
+from omegaconf import OmegaConf
 from rasterizer_bench.check import check, check_long_sort
 from rasterizer_bench.scenes import make_scene, make_shell
-from rasterizer_bench.stages import time_stages
+from rasterizer_bench.stages import time_cpu_stages, time_stages
 from rasterizer_bench.timing import OUT_OF_MEMORY, take_turns
 
 from cadam3d.build import component
@@ -71,10 +77,12 @@ def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--degrees", type=int, choices=range(4), nargs="+", help="of spherical harmonics")
     parser.add_argument("--repeats", type=measuring.positive, default=10, metavar="N")
     # With more threads, other load on the machine affects every number.
-    parser.add_argument("--threads", type=measuring.positive, default=1, metavar="N")
+    parser.add_argument("--threads", **several, default=[1])
     parser.add_argument("--check", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--check-only", action="store_true", help="check the backends without timing them")
-    parser.add_argument("--stages", action=argparse.BooleanOptionalAction, default=True, help="of cuda")
+    parser.add_argument(
+        "--stages", action=argparse.BooleanOptionalAction, default=True, help="of cuda and cpu"
+    )
     parser.add_argument("--json", type=measuring.new_file, metavar="FILE", help="also write all results")
     args = parser.parse_args(words)
     for name, value in DEFAULTS[args.device].items():
@@ -127,17 +135,22 @@ def time_all(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher
     device = torch.device(args.device)
     report: dict[str, Any] = {"machine": measuring.machine(device), "rows": [], "stages": []}
     report["settings"] = {name: value for name, value in vars(args).items() if name != "json"}
-    print(f"{report['machine']['name']}, {args.threads} thread(s), {args.repeats} repetitions; milliseconds")
+    print(f"{report['machine']['name']}, {args.repeats} repetitions; milliseconds")
     for degree, count in product(args.degrees, args.counts):
         gaussians = make_shell(count, degree, device)
-        for size, views in product(args.sizes, args.views):
-            at = {"count": count, "size": size, "views": views, "degree": degree}
+        for size, views, threads in product(args.sizes, args.views, args.threads):
+            torch.set_num_threads(threads)
+            at = {"count": count, "size": size, "views": views, "degree": degree, "threads": threads}
             scene = make_scene(gaussians, size, views)
             timings = take_turns(backends, scene, args.repeats)
             report["rows"] += make_rows(at, timings)
             print_table(make_rows(at, timings))
-            if launcher is not None and args.stages and timings["cuda"]:
+            timing = None
+            if args.stages and launcher is not None and timings["cuda"]:
                 timing = time_stages(launcher, scene, args.repeats)
+            elif args.stages and timings.get("cpu"):
+                timing = time_cpu_stages(backends["cpu"], scene, args.repeats)
+            if timing is not None:
                 print_table(timing.stages)
                 report["stages"].append(at | vars(timing))
             # The file is written after every scene, because a later one may exceed the memory.
@@ -170,7 +183,7 @@ def run(args: argparse.Namespace, backends: dict[str, Rasterizer], launcher: Lau
 
     ``launcher`` is that of the backend ``cuda``. If it is given, the stages of that backend are timed too.
     """
-    torch.set_num_threads(args.threads)
+    torch.set_num_threads(args.threads[0])
     good = check_all(backends, launcher, torch.device(args.device)) if args.check else backends
     if good and not args.check_only:
         time_all(args, good, launcher if "cuda" in good else None)

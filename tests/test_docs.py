@@ -169,8 +169,9 @@ def test_a_documented_line_composes(line, place, monkeypatch, capsys):
     assert calls, "no program was called"
     for words in calls:
         if words[0] == "python":
+            # A line that begins with ../ runs a script of another commit, checked out beside this one.
             files = [word for word in words if word.endswith(".py") or word.startswith("tests/")]
-            assert all((REPOSITORY / file).exists() for file in files)
+            assert all(file.startswith("../") or (REPOSITORY / file).exists() for file in files)
         if words[0] != "cadam3d" or (len(words) == 2 and words[1] != "doctor"):
             continue  # another program, or only the name of a command
         is_only_printed = words[1] not in cli.COMMANDS or "--help" in words or "--cfg" in words

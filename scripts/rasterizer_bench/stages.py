@@ -1,9 +1,11 @@
-"""The stages of the CUDA rasterizer: the time that the GPU spends in their kernels.
+"""The stages of the CUDA and the CPU rasterizer: the time that is spent in their kernels.
 
-Kernels are timed by the GPU itself, through ``torch.profiler``. Clocks around the launches would include the
-time in which an idle GPU waits for the host, which takes longer than a short kernel.
+Kernels of CUDA are timed by the GPU itself, through ``torch.profiler``. Clocks around the launches would
+include the time in which an idle GPU waits for the host, which takes longer than a short kernel. The kernels
+of the CPU time themselves.
 """
 
+import ctypes
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,7 +15,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from measuring import in_turns, median, milliseconds
+from measuring import in_turns, median, milliseconds, now
 from rasterizer_bench.scenes import Scene
 from torch import Tensor
 
@@ -34,9 +36,11 @@ STAGES = {
     "blend backward": ("blend_backward",),
     "project backward": ("project_backward", "sum_absolutes", "centre_backward"),
 }
+# The stages of a pass on the CPU, in the order of ``enum Stage`` in cadam3d/rasterizer/kernels/cpu.cpp.
+CPU_STAGES = ("project", "depth order", "tile lists", "blend forward", "blend backward", "gather", "centres")
 # Kernels and copies of torch, such as filling and adding.
 TORCH = "torch"
-# The wall clock without all kernels: the GPU waits for the host.
+# The wall clock without all kernels: a GPU waits for the host; on a CPU, Python and autograd.
 REST = "rest"
 
 
@@ -151,7 +155,7 @@ def _stage_of(kernel: str, before: str, stage: str) -> str:
 class SceneTiming:
     """All stages of one scene, forward and backward."""
 
-    stages: list[dict[str, Any]]  # each with ``stage``, ``launches`` and ``median_ms``
+    stages: list[dict[str, Any]]  # each with ``stage``, ``median_ms`` and on CUDA ``launches``
     wall_ms: float  # without the profiler
     kernel_ms: float  # the sum of all kernels and copies
 
@@ -183,13 +187,35 @@ def time_stages(launcher: Launcher, scene: Scene, repeats: int) -> SceneTiming:
     wall = median(in_turns({"": lambda: milliseconds(lambda: run(plain), device)}, repeats, warm_up=1)[""])
     samples = [time_kernels() for _ in range(repeats)]
     medians = {stage: median([sum(sample[stage]) for sample in samples]) for stage in samples[0]}
+    return _timing(medians, wall, {stage: len(times) for stage, times in samples[-1].items()})
+
+
+def time_cpu_stages(rasterizer: Rasterizer, scene: Scene, repeats: int) -> SceneTiming:
+    """Return the times of all stages of ``rasterizer=cpu``, as medians; the last one is ``REST``."""
+    device = scene.gaussians.device
+
+    def run() -> dict[str, Any]:
+        scene.zero_grad()
+        begin = now(device)
+        output = rasterizer.render(scene.gaussians, scene.cameras, scene.background)
+        scene.backward((output.rgb, output.alpha, output.depth))
+        wall = 1e3 * (now(device) - begin)
+        # The node of the graph is the context of ``rasterizer/native.py``, which holds the pass.
+        run = output.rgb.grad_fn.kernels
+        seconds, counts = (ctypes.c_double * len(CPU_STAGES))(), (ctypes.c_int64 * 3)()
+        run.kernels.cadam3d_measure(run.handle, seconds, counts)
+        stages = {stage: 1e3 * each for stage, each in zip(CPU_STAGES, seconds, strict=True)}
+        return {"wall": wall, "stages": stages}
+
+    # The first passes get memory from the system.
+    found = median(in_turns({"": run}, repeats, warm_up=2)[""])
+    return _timing(found["stages"], found["wall"], {})
+
+
+def _timing(medians: dict[str, float], wall: float, launches: dict[str, int]) -> SceneTiming:
     kernel_ms = sum(medians.values())
-    rows = [
-        {
-            "stage": stage,
-            "launches": len(samples[-1].get(stage, ())),
-            "median_ms": ms,
-        }
-        for stage, ms in (medians | {REST: wall - kernel_ms}).items()
-    ]
+    rows: list[dict[str, Any]] = []
+    for stage, ms in (medians | {REST: wall - kernel_ms}).items():
+        counted = {"launches": launches.get(stage, 0)} if launches else {}
+        rows.append({"stage": stage, **counted, "median_ms": ms})
     return SceneTiming(rows, wall, kernel_ms)

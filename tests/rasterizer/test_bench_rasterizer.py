@@ -21,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))  # as Python does
 import bench_rasterizer
 from rasterizer_bench import check, timing
 from rasterizer_bench.scenes import make_scene, make_shell
+from rasterizer_bench.stages import CPU_STAGES, REST
 
 CPU = torch.device("cpu")
 TINY = ("--counts", "60", "--sizes", "20", "--repeats", "2", "--views", "2")
@@ -85,7 +86,7 @@ def test_every_backend_is_checked_timed_and_written_for_every_scene(kernel_build
     assert second["ratio"] == first["step_ms"] / second["step_ms"]
     assert written["machine"]["torch"] == torch.__version__
     assert written["settings"]["counts"] == [50, 80]
-    assert not written["stages"]
+    assert [row["stage"] for row in written["stages"][0]["stages"]] == [*CPU_STAGES, REST]
 
 
 # -------------------------------------------------------------------------- backends that fail the check

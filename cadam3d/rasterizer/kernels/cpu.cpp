@@ -243,7 +243,7 @@ struct Scratch {
   size_t bytes() const { return order.bytes() + counts.bytes() + next.bytes(); }
 };
 
-// Mirrored by ``STAGES`` in scripts/bench_large.py.
+// Mirrored by ``CPU_STAGES`` in scripts/rasterizer_bench/stages.py.
 enum Stage : int { PROJECT, ORDER, LISTS, BLEND, BLEND_BACKWARD, GATHER, CENTRE, STAGES };
 
 struct Frame {
