@@ -17,7 +17,7 @@ runs, but its training loop is replaced by three passes, which continue one anot
    readback is a number, or a number of rows, that Python needs from a tensor: on CUDA it waits for the
    device. On a CPU, tensors that never leave the host count too.
 
-Bytes per Gaussian are counted from the tensors. The networks of ``--priors random`` have the sizes of Stable
+The networks of ``--priors random`` have the sizes of Stable
 Diffusion 2.1 (``scripts/bench_recipes.py``); ``--tiny`` replaces them by small ones. On a CPU, add smaller
 images too (``--priors random --tiny camera.size=64 prior.size=64``): at 512 pixels, a step takes minutes.
 
@@ -27,15 +27,14 @@ Every prior has a process of its own. With ``--base`` both trees run in turn.
 import argparse
 import json
 import os
-import subprocess
 import sys
 import tempfile
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import measuring
-from measuring import HERE, add_base, find_trees
 from step_bench.clocks import ORDER, replaced
 from step_bench.passes import Run, three_passes
 
@@ -49,92 +48,58 @@ PRIORS = {
 
 def main(words: list[str] | None = None) -> None:
     args = read_arguments(words)
-    if args.tree is not None:
+    if args.out is not None:
         args.out.write_text(json.dumps(measure_here(args.priors[0], args)))
         return
-    trees = find_trees(args.base)
+    trees = measuring.find_trees(args.base)
     results: dict[str, list[Any]] = {name: [] for name in trees}
     for prior in args.priors:
-        turns: dict[str, list[Any]] = {name: [] for name in trees}
-        try:
-            for _ in range(args.repeats if args.base else 1):
-                for name, tree in trees.items():
-                    turns[name].append(measure_there(tree, prior, args))
-        except LeftOutError as error:
-            print(f"{prior} is left out: {error}")
-            continue
-        for name, found in turns.items():
-            results[name].append(measuring.median(found))
-        print(as_table({name: found[-1] for name, found in results.items()}), flush=True)
-    if args.json:
-        measuring.write(args.json, {"machine": measuring.machine(args.device), **results})
-    if not results["here"]:
-        raise SystemExit(1)
+        works = {name: partial(measure_there, tree, prior, args) for name, tree in trees.items()}
+        turns = measuring.in_turns(works, args.repeats if args.base else 1)
+        found = {name: measuring.median(each) for name, each in turns.items()}
+        for name, each in found.items():
+            results[name].append(each)
+        print(as_table(found), flush=True)
+    measuring.write(args.json, {"machine": measuring.machine(args.device), **results})
 
 
 def read_arguments(words: list[str] | None) -> argparse.Namespace:
     parser = measuring.parser_of(__doc__)
     parser.add_argument("--priors", nargs="+", choices=list(PRIORS), help="default: all, random on CUDA only")
     parser.add_argument("--device", default="cpu", help="cpu (default), cuda or auto")
-    parser.add_argument(
-        "--steps", type=measuring.positive, default=40, help="steps of each of the first two passes"
-    )
-    parser.add_argument(
-        "--warmup", type=measuring.positive, default=5, help="steps before them that are not timed"
-    )
-    parser.add_argument("--threads", type=measuring.positive, default=1, help="threads of torch (default: 1)")
+    number = {"type": measuring.positive}
+    parser.add_argument("--steps", **number, default=40, help="steps of each of the first two passes")
+    parser.add_argument("--warmup", **number, default=5, help="steps before them that are not timed")
+    parser.add_argument("--threads", **number, default=1, help="threads of torch (default: 1)")
     parser.add_argument("--tiny", action="store_true", help="small networks for --priors random")
     parser.add_argument("--models", type=Path, help="folder that keeps the random networks")
-    add_base(parser)
-    parser.add_argument(
-        "--repeats", type=measuring.positive, default=3, help="turns of each tree with --base (default: 3)"
-    )
+    measuring.add_base(parser)
+    parser.add_argument("--repeats", **number, default=3, help="turns of each tree with --base (default: 3)")
     # For the processes that measure one prior of one tree.
-    parser.add_argument("--tree", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--json", type=measuring.new_file, help="file for all numbers")
     parser.add_argument("settings", nargs="*", help="more settings of cadam3d train, such as steps=1000")
     # Settings come first, because the list of priors would swallow those after it.
-    words = sorted(sys.argv[1:] if words is None else words, key=lambda word: not is_setting(word))
+    words = sorted(
+        sys.argv[1:] if words is None else words, key=lambda word: "=" not in word or word.startswith("-")
+    )
     args = parser.parse_intermixed_args(words)
     if args.priors is None:
         args.priors = [name for name in PRIORS if name != "random" or args.device.startswith("cuda")]
     return args
 
 
-def is_setting(word: str) -> bool:
-    return "=" in word and not word.startswith("-")
-
-
-# -------------------------------------------------------------------------- processes
-
-
 def measure_there(tree: Path, prior: str, args: argparse.Namespace) -> dict[str, Any]:
     """Return the result of one prior in ``tree``, measured in a process of its own."""
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "found.json"
-        line = [sys.executable, __file__, "--tree", str(tree), "--out", str(out), "--priors", prior]
-        for name in ("device", "steps", "warmup", "threads", "models"):
-            value = getattr(args, name)
-            line += [] if value is None else [f"--{name}", str(value)]
-        line += [*(["--tiny"] if args.tiny else []), *args.settings]
-        done = subprocess.run(line, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            lines = done.stderr.strip().splitlines()
-            raise LeftOutError(lines[-1] if lines else f"the process ended with code {done.returncode}")
-        return json.loads(out.read_text())
-
-
-# -------------------------------------------------------------------------- one prior of one tree
-
-
-class LeftOutError(Exception):
-    """A prior that cannot be measured here. The message says what is missing."""
+    words = ["--priors", prior, *(["--tiny"] if args.tiny else []), *args.settings]
+    for name in ("device", "steps", "warmup", "threads", "models"):
+        value = getattr(args, name)
+        words += [] if value is None else [f"--{name}", str(value)]
+    return measuring.in_checkout(__file__, tree, words)
 
 
 def measure_here(prior: str, args: argparse.Namespace) -> dict[str, Any]:
     """Run ``cadam3d train`` in this process up to its training loop, and return what the passes find."""
-    sys.path.insert(0, str(args.tree))
     os.environ["TQDM_DISABLE"] = "1"
     import torch
 
@@ -172,15 +137,11 @@ def random_settings(prior: str, args: argparse.Namespace, folder: Path) -> list[
     """Return the settings for networks with random weights, which are written first if that is needed."""
     if prior != "random":
         return []
-    sys.path.insert(1, str(HERE / "scripts"))
     bench_recipes = import_module("bench_recipes")
     model = (args.models or folder) / "stable_diffusion"
     if not (model / "model_index.json").is_file():
         bench_recipes.stable_diffusion(model, args.tiny, weights=True)
     return [f"prior.path={model}", f"prior.cache_dir={model / 'texts'}"]
-
-
-# -------------------------------------------------------------------------- output
 
 
 def as_table(found: dict[str, Any]) -> str:
@@ -197,11 +158,10 @@ def as_table(found: dict[str, Any]) -> str:
         f"\n{measuring.table(rows)}\n",
     ]
     for tree, each in found.items():
-        sizes = ", ".join(f"{name} {size:.0f}" for name, size in each["bytes_per_gaussian"].items())
         peak = "" if each["peak_bytes"] is None else f"; peak memory {each['peak_bytes'] / 2**20:.0f} MiB"
         lines.append(
             f"{tree}: whole step {each['wall_ms']:.2f} ms by the clock, {each['cpu_ms']:.2f} ms of CPU time; "
-            f"refinement {each['refinement_ms']:.2f} ms; bytes per Gaussian: {sizes}{peak}"
+            f"refinement {each['refinement_ms']:.2f} ms{peak}"
         )
     if "base" in found:
         ratios = [here[key] / found["base"][key] for key in ("wall_ms", "cpu_ms")]

@@ -11,6 +11,7 @@ import shutil
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -68,6 +69,20 @@ def find_trees(base: Path | None) -> dict[str, Path]:
 def environment_of(tree: Path) -> dict[str, str]:
     """Return the environment of a process that imports the package of a checkout."""
     return os.environ | {"PYTHONPATH": str(tree)}
+
+
+def in_checkout(script: str, tree: Path, words: Sequence[str]) -> dict[str, Any]:
+    """Return what a script writes as JSON to its ``--out``, in a process that imports from ``tree``.
+
+    Ends the program if the script fails, which has reported the reason.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "found.json"
+        command = [sys.executable, script, *words, "--out", str(out)]
+        code = subprocess.call(command, stdout=subprocess.DEVNULL, env=environment_of(tree))
+        if code:
+            sys.exit(f"{Path(script).stem} ended with exit code {code} for {tree}")
+        return json.loads(out.read_text(encoding="utf-8"))
 
 
 def in_turns(works: Mapping[str, Callable[[], Any]], repeats: int, warm_up: int = 0) -> dict[str, list[Any]]:

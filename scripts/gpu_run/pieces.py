@@ -133,17 +133,16 @@ def times(found: Mapping[str, object]) -> list[Piece]:
 
 def explains(found: Mapping[str, object]) -> list[Piece]:
     """Return the pieces that explain the times."""
-    small = ("--priors", "exact", "learned", "--json", RESULT)
     recipes = ("--vram", "low", "--steps", "20", "--json", RESULT)
     return [
         Piece("kernels", own("kernels"), 150.0),
         Piece("sorts", own("sorts"), 60.0),
         Piece("ncu", own("ncu", "--tool", str(found.get("ncu"))), 120.0, needs=("ncu",)),
-        Piece("step", script("bench_step", *small), 120.0),
+        Piece("step", script("bench_step", "--priors", "exact", "--json", RESULT), 60.0),
         Piece(
-            "step of a network",
-            script("bench_step", "--priors", "random", "--json", RESULT),
-            180.0,
+            "step with a network",
+            script("bench_step", "--priors", "learned", "random", "--json", RESULT),
+            240.0,
             needs=("diffusers",),
         ),
         Piece("recipes", script("bench_recipes", *recipes), 240.0, needs=("diffusers",)),

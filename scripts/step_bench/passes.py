@@ -83,7 +83,7 @@ def time_whole(run: Run, args: argparse.Namespace, device: Any) -> dict[str, Any
 
 
 def time_parts(run: Run, args: argparse.Namespace, watch: Watch) -> dict[str, Any]:
-    """Return the median milliseconds of each part, of a refinement, and the bytes per Gaussian."""
+    """Return the median milliseconds of each part, and those of a refinement."""
     rows: list[dict[str, float]] = []
     totals: list[float] = []
     watch.is_on = True
@@ -99,44 +99,12 @@ def time_parts(run: Run, args: argparse.Namespace, watch: Watch) -> dict[str, An
         row["rest"] = later - earlier - sum(row.values())
     names = [name for name in ORDER if any(name in row for row in rows)]
     parts = {name: 1e3 * statistics.median(row.get(name, 0.0) for row in rows[1:]) for name in names}
-    gradients = gradient_bytes(run)
     state, trainer = run.state, run.trainer
     started = watch.now()
     trainer._refine(state, next(filter(trainer.refine.refines_at, range(1, MOST_STEPS)), state.step))
     refinement = watch.now() - started
     watch.is_on = False
-    n = len(state.gaussians)
-    moments = [part for part in state.optimizer.state_dict().values() if isinstance(part, dict)]
-    held = {
-        "parameters": sum(tensor.nbytes for tensor in state.gaussians.tensors().values()) / n,
-        "gradients": gradients,
-        "moments": sum(tensor.nbytes for part in moments for tensor in part.values()) / n,
-        "densifier": sum(rows.nbytes for rows in state.densifier.to_dict().values()) / n,
-    }
-    return {
-        "parts_ms": parts,
-        "gaussians": n,
-        "refinement_ms": 1e3 * refinement,
-        "bytes_per_gaussian": held,
-    }
-
-
-def gradient_bytes(run: Run) -> float:
-    """Return the bytes per Gaussian of the gradients that the optimizer finds in one step."""
-    from cadam3d.optimizer import GaussianOptimizer
-
-    found = []
-    step = GaussianOptimizer.step
-
-    def observed(owner: Any, *args: Any) -> Any:
-        gaussians = owner.gaussians
-        grads = [tensor.grad for tensor in gaussians.tensors().values()]
-        found.append(sum(grad.nbytes for grad in grads if grad is not None) / len(gaussians))
-        return step(owner, *args)
-
-    with replaced([(GaussianOptimizer, "step", observed)]):
-        run.steps(1, lambda _: None)
-    return found[-1]
+    return {"parts_ms": parts, "gaussians": len(state.gaussians), "refinement_ms": 1e3 * refinement}
 
 
 def count_operations(run: Run, watch: Watch) -> dict[str, Any]:
