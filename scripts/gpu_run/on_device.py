@@ -77,13 +77,12 @@ def gsplat() -> dict[str, Any]:
     """Compile or load gsplat, and compare it with the reference."""
     import torch
     from rasterizer_bench.check import check
-
-    from cadam3d.rasterizer.gsplat import GsplatRasterizer
+    from rasterizer_bench.yardstick import Gsplat
 
     device, begin = torch.device("cuda"), time.perf_counter()
-    GsplatRasterizer().prepare(device)
+    Gsplat().prepare(device)
     seconds = time.perf_counter() - begin
-    troubles = check("gsplat", GsplatRasterizer(), device)
+    troubles = check("gsplat", Gsplat(), device)
     verdict = "; ".join(troubles) or "agrees with the reference"
     return {"says": f"{verdict}; ready in {seconds:.0f} s", "failed": bool(troubles), "is_built": True}
 
