@@ -19,9 +19,7 @@ def ring(**changes: Any) -> RingProtocol:
         "fov_y_deg": 40.0,
         "size": 32,
         "background": [1.0, 1.0, 1.0],
-        "crop": "none",
         "text": "{}",
-        "aggregation": "mean",
         "models": {},
     }
     return RingProtocol(**settings | changes)

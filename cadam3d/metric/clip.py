@@ -91,23 +91,21 @@ def load_clip(source: TransformerSource, device: torch.device) -> Clip:
 def _loaded(found: TransformerFolder, _sha256: str, device: torch.device) -> Clip:
     import transformers
 
-    check_clip(found)  # before the weights, which take time
     return assembled(found, found.load(transformers.CLIPModel), found.facts(), device)
 
 
 def assembled(found: TransformerFolder, model: Any, facts: dict[str, Any], device: torch.device) -> Clip:
     """Return a CLIP model, on ``device``, with the tokenizer and the preprocessing in a folder."""
     tokenizer, preprocess = check_clip(found)
-    return Clip(model.to(device), tokenizer, preprocess, facts | _settings(model, preprocess))
-
-
-def _settings(model: Any, preprocess: Any) -> dict[str, Any]:
-    """Return what is not in the weights and changes a score, for its record: pictures and activations."""
     known = preprocess.to_dict()
-    # With lists instead of tuples, as the record has them in a file.
-    steps = json.loads(json.dumps({name: known.get(name) for name in PREPROCESSING}))
     activations = {model.config.text_config.hidden_act, model.config.vision_config.hidden_act}
-    return {"preprocessing": steps, "activation": " and ".join(sorted(activations))}
+    # What is not in the weights and changes a score.
+    settings = {
+        # With lists instead of tuples, as the record has them in a file.
+        "preprocessing": json.loads(json.dumps({name: known.get(name) for name in PREPROCESSING})),
+        "activation": " and ".join(sorted(activations)),
+    }
+    return Clip(model.to(device), tokenizer, preprocess, facts | settings)
 
 
 def check_clip(found: TransformerFolder) -> tuple[Any, Any]:
@@ -123,20 +121,11 @@ def check_clip(found: TransformerFolder) -> tuple[Any, Any]:
     # If the files of a tokenizer are missing, transformers silently makes one that knows no word.
     if len(tokenizer) < found.read(transformers.CLIPConfig).text_config.vocab_size / 2:
         raise found.damaged("files of its tokenizer are missing")
-    return tokenizer, found.read(_preprocessing())
-
-
-def _preprocessing() -> Any:
-    """Return the class that resizes with Pillow, as the published models were trained and are evaluated.
-
-    With torchvision, transformers would prefer another class that rounds differently, and the scores of a
-    machine would depend on what is installed there. Versions of transformers without the first name have
-    only the class that uses Pillow, under the second name.
-    """
-    import transformers
-
+    # This class resizes with Pillow, as the published models were trained. With torchvision, transformers
+    # would prefer another class that rounds differently. Older versions have one class, under another name.
     name = "CLIPImageProcessorPil"
-    return getattr(transformers, name if hasattr(transformers, name) else "CLIPImageProcessor")
+    name = name if hasattr(transformers, name) else "CLIPImageProcessor"
+    return tokenizer, found.read(getattr(transformers, name))
 
 
 def _vectors(output: Any) -> Float[Tensor, "n d"]:

@@ -58,18 +58,18 @@ def luma(image: Float[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
     return np.round(stored @ LUMA + LUMA_BLACK).astype(np.float32)
 
 
-def distance(features: Float[np.ndarray, "b f"], pristine: Pristine, keep_flat: bool) -> float:
-    """Return the distance between the blocks of one image and the model (paper eq. 10); lower is better.
+def distance(image: Float[np.ndarray, "h w 3"], pristine: Pristine) -> float:
+    """Return the distance between the blocks of an image and the model (paper eq. 10); lower is better.
 
-    Blocks with missing features do not count for the covariance. With ``keep_flat``, the features that they
-    have count for the mean. Returns NaN if fewer than two blocks have all features.
+    Blocks with missing features count for the mean but not for the covariance. Returns NaN if fewer than two
+    blocks have all features.
     """
+    features = block_features(luma(image), pristine.window)
     textured = features[~np.isnan(features).any(axis=1)]
     if len(textured) < 2:
         return float("nan")
-    mean = np.nanmean(features, axis=0) if keep_flat else textured.mean(axis=0)
     covariance = (pristine.covariance + np.cov(textured, rowvar=False)) / 2
-    gap = pristine.mean - mean
+    gap = pristine.mean - np.nanmean(features, axis=0)
     return float(np.sqrt(gap @ np.linalg.pinv(covariance) @ gap))
 
 

@@ -5,10 +5,9 @@ from pathlib import Path
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import fail, require_choice, require_whole
+from cadam3d.core.checks import fail, require_whole
 from cadam3d.core.number import Number
 from cadam3d.metric import natural
 from cadam3d.metric.base import Measurand, Measurement
@@ -18,7 +17,6 @@ from cadam3d.metric.transformer import model_facts
 OWN_PARAMETERS = Path(__file__).with_name("niqe_parameters.npz")
 # The name of these parameters in the record of a number.
 OWN_NAME = "cadam3d, from eight photographs"
-PLAIN = ("keep", "drop")  # what to do with plain blocks
 SMALLEST = 2 * natural.BLOCK  # pixels; four blocks
 
 
@@ -35,10 +33,6 @@ class Niqe(ScoreMetric):
     )
 
     parameters: str | None  # a file such as basicsr's niqe_pris_params.npz; None = this package's own
-    plain_blocks: str  # "keep" or "drop"
-
-    def __post_init__(self) -> None:
-        require_choice("metric.niqe.plain_blocks", self.plain_blocks, PLAIN)
 
     def prepare(self) -> None:
         """Read the parameters."""
@@ -54,8 +48,12 @@ class Niqe(ScoreMetric):
         except Exception as error:
             expected = "a file such as basicsr's niqe_pris_params.npz"
             raise fail("metric.niqe.parameters", expected=expected, got=self.parameters) from error
-        facts = {**model_facts(self.parameters or OWN_NAME, None, [file]), "plain_blocks": self.plain_blocks}
-        return Scorer(score=lambda images, _text: self._distances(images, pristine), facts=facts)
+
+        def score(images: Tensor, _text: str) -> Tensor:
+            distances = [natural.distance(image, pristine) for image in images.cpu().numpy()]
+            return torch.tensor(distances, dtype=torch.float64)
+
+        return Scorer(score=score, facts=model_facts(self.parameters or OWN_NAME, None, [file]))
 
     def measure(self, measurand: Measurand) -> Measurement:
         """Return ``niqe`` with its record; nothing if no view has two blocks with texture.
@@ -76,10 +74,3 @@ class Niqe(ScoreMetric):
             return Measurement({}, warnings=warnings)
         facts = {**scorer.facts, "views_left_out": lost}
         return replace(self.measurement(known, None, facts), warnings=warnings)
-
-    def _distances(self, images: Float[Tensor, "v h w 3"], pristine: natural.Pristine) -> Float[Tensor, "v"]:
-        keeps = self.plain_blocks == "keep"
-        lumas = [natural.luma(image) for image in images.cpu().numpy()]
-        features = [natural.block_features(luma, pristine.window) for luma in lumas]
-        distances = [natural.distance(each, pristine, keeps) for each in features]
-        return torch.tensor(distances, dtype=torch.float64)

@@ -14,19 +14,14 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from cadam3d.core.cameras import Cameras, orbit
-from cadam3d.core.checks import require, require_choice, require_range, require_whole
+from cadam3d.core.checks import require, require_range, require_whole
 from cadam3d.core.pictures import PictureSettings
-from cadam3d.core.rendering import RenderFn, RenderOutput
+from cadam3d.core.rendering import RenderFn
 
 # Views that are rendered and scored at once, which bounds the memory.
 VIEWS_AT_ONCE = 4
-CROPS = ("none", "object")
-AGGREGATIONS = ("mean", "best")
-INSIDE = 0.5  # the alpha above which a pixel belongs to the object
-MARGIN = 0.1  # around a cropped object, as a share of its longer side
 PROMPT = "{}"  # the place of the prompt in a text
 
 
@@ -35,9 +30,9 @@ class Protocol(PictureSettings, ABC):
     """Views, pictures, text and models of an evaluation. The subclasses place the cameras."""
 
     node: ClassVar[str] = "protocol"
+    is_mean: ClassVar[bool]  # whether the number is the mean of the values, so that it has an interval
 
     name: str
-    crop: str  # before the preprocessing of the model: "none", or "object" for a square around it
     text: str  # what the picture is compared with; {} is the prompt
     # From the name of a scorer, such as "clip", to the id of a model on the hub and its revision, a commit or
     # None for the newest.
@@ -45,7 +40,6 @@ class Protocol(PictureSettings, ABC):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_choice("protocol.crop", self.crop, CROPS)
         is_text = self.text.count(PROMPT) == 1
         require(is_text, "protocol.text", expected=f"a text with {PROMPT} once", got=self.text)
 
@@ -58,11 +52,6 @@ class Protocol(PictureSettings, ABC):
     def aggregate(self, values: Float[Tensor, "v"], *, less_is_better: bool) -> float:
         """Return the one number that the values of all views become."""
 
-    @property
-    @abstractmethod
-    def is_mean(self) -> bool:
-        """Return whether the number is the mean of the values, so that it has an interval."""
-
     def text_of(self, prompt: str) -> str:
         """Return the text with which the pictures are compared."""
         return self.text.replace(PROMPT, prompt)
@@ -70,36 +59,27 @@ class Protocol(PictureSettings, ABC):
     def images(self, render: RenderFn) -> Iterator[Float[Tensor, "v h w 3"]]:
         """Yield the pictures of the asset that ``render`` shows, in [0, 1], a few views at a time."""
         for some in self.cameras.parts(VIEWS_AT_ONCE):
-            output = render(some, self.backgrounds(len(some)))
-            yield self._cropped(output)
+            yield render(some, self.backgrounds(len(some))).rgb.detach().float().clamp(0, 1)
 
     def record(self) -> dict[str, Any]:
         """Return all settings as plain data, for the record of a number; models are recorded with it."""
         settings = {key: value for key, value in asdict(self).items() if key != "models"}
         return {key: list(value) if isinstance(value, tuple) else value for key, value in settings.items()}
 
-    def _cropped(self, output: RenderOutput) -> Float[Tensor, "v h w 3"]:
-        images = output.rgb.detach().float().clamp(0, 1)
-        if self.crop == "none":
-            return images
-        fill = self.backgrounds(1)[0].to(images)
-        pairs = zip(images, output.alpha.detach(), strict=True)
-        return torch.stack([_around_object(image, alpha, fill) for image, alpha in pairs])
-
 
 @dataclass(frozen=True, kw_only=True)
 class RingProtocol(Protocol):
     """Views that are evenly spaced on rings, one ring per elevation; the first of each sees the front."""
 
+    is_mean: ClassVar[bool] = True
+
     views: int  # >= 1, per elevation
     elevations_deg: Sequence[float]  # in [-90, 90]
-    aggregation: str  # "mean", or "best" for the best view
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.require_views(self.views)
         self.require_angles("elevations_deg", self.elevations_deg, limit=90)
-        require_choice("protocol.aggregation", self.aggregation, AGGREGATIONS)
 
     @cached_property
     def cameras(self) -> Cameras:
@@ -109,13 +89,8 @@ class RingProtocol(Protocol):
         return self.cameras_at(azimuth.repeat(len(elevation)), elevation.repeat_interleave(self.views))
 
     def aggregate(self, values: Float[Tensor, "v"], *, less_is_better: bool) -> float:
-        """Return the mean, or the value of the best view."""
-        return float(values.mean() if self.is_mean else _best(values, less_is_better))
-
-    @property
-    def is_mean(self) -> bool:
-        """Return whether the number is the mean."""
-        return self.aggregation == "mean"
+        """Return the mean."""
+        return float(values.mean())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,6 +101,8 @@ class SphereProtocol(Protocol):
     each vertex. Then the values of all vertices are smoothed ``rounds`` times, by the mean over a vertex and
     its neighbours, so that one lucky view does not decide. The best vertex counts.
     """
+
+    is_mean: ClassVar[bool] = False
 
     subdivisions: int  # 0 to 4; each divides every triangle into four
     # More fields of view beside ``fov_y_deg``, each in (0, 180) degrees.
@@ -159,12 +136,7 @@ class SphereProtocol(Protocol):
         near[one, other] = near[other, one] = 1
         for _ in range(self.rounds):
             field = near @ field / near.sum(dim=1)
-        return float(_best(field, less_is_better))
-
-    @property
-    def is_mean(self) -> bool:
-        """Return False: the number belongs to the best vertex."""
-        return False
+        return float(field.min() if less_is_better else field.max())
 
     @cached_property
     def _mesh(self) -> Any:
@@ -175,26 +147,3 @@ class SphereProtocol(Protocol):
         from trimesh.creation import icosphere  # slow to import
 
         return icosphere(subdivisions=self.subdivisions)
-
-
-def _best(values: Tensor, less_is_better: bool) -> Tensor:
-    return values.min() if less_is_better else values.max()
-
-
-def _around_object(
-    image: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], fill: Float[Tensor, "3"]
-) -> Float[Tensor, "h w 3"]:
-    """Return the square around the object, resized to the size of the image; the image if it is empty."""
-    rows, columns = (alpha > INSIDE).any(dim=1).nonzero(), (alpha > INSIDE).any(dim=0).nonzero()
-    if len(rows) == 0:
-        return image
-    (top, bottom), (left, right) = ((int(each[0]), int(each[-1]) + 1) for each in (rows, columns))
-    side = round(max(bottom - top, right - left) * (1 + 2 * MARGIN))
-    # The square may reach beyond the image, where there is only background.
-    height, width = alpha.shape
-    wide = fill.repeat(height + 2 * side, width + 2 * side, 1)
-    wide[side:-side, side:-side] = image
-    first_row, first_column = (top + bottom + side) // 2, (left + right + side) // 2
-    square = wide[first_row : first_row + side, first_column : first_column + side]
-    resized = interpolate(square.permute(2, 0, 1)[None], size=(height, width), mode="bicubic", antialias=True)
-    return resized[0].permute(1, 2, 0).clamp(0, 1)

@@ -133,7 +133,7 @@ class ModelMetric(ScoreMetric):
         The weights are not loaded, because they would take memory during training.
         """
         found = self.source().find()
-        found.check()
+        found.weights()
         self.check_model(found)
 
     @abstractmethod

@@ -97,28 +97,25 @@ class TransformerFolder:
         except (OSError, ValueError) as error:
             raise self.damaged(f"{name}: {short(error)}") from error
 
-    def check(self) -> None:
-        """Raise ``UserError`` if weights are missing or incomplete. Only their headers are read."""
-        from safetensors import SafetensorError, safe_open
-
-        for file in self.weights():
-            try:
-                with safe_open(file, framework="pt"):
-                    pass
-            except (SafetensorError, OSError) as error:
-                raise self.damaged(f"{file.name}: {short(error)}") from error
-
     def weights(self) -> list[Path]:
         """Return the files of the weights, in the order of their names.
 
-        Raises ``UserError`` if there are none in the format of safetensors.
+        Raises ``UserError`` if there are none in the format of safetensors, or if one is incomplete. Only
+        their headers are read.
         """
+        from safetensors import SafetensorError, safe_open
+
         names = [WEIGHTS]
         if not (self.folder / WEIGHTS).is_file() and (self.folder / SHARDS).is_file():
             names = sorted(set(self.entries(SHARDS)["weight_map"].values()))
         for name in names:
             if not (self.folder / name).is_file():
                 raise self.damaged(f"it has no {name}, and no other format is read, since it could run code")
+            try:
+                with safe_open(self.folder / name, framework="pt"):
+                    pass
+            except (SafetensorError, OSError) as error:
+                raise self.damaged(f"{name} cannot be loaded ({short(error)})") from error
         return [self.folder / name for name in names]
 
     def load(self, kind: Any, dtype: torch.dtype = torch.float32) -> Any:
@@ -175,12 +172,13 @@ def sha256_of(files: Sequence[Path]) -> str:
     For one file it is the SHA-256 that ``sha256sum`` prints and the hub shows. For several it is the SHA-256
     of the lines that ``sha256sum`` prints for them, in the order of their names.
     """
-    states = [(file.resolve(), file.stat()) for file in files]
-    hashes = [_hashed(file, state.st_size, state.st_mtime_ns) for file, state in states]
+    hashes = {
+        file.name: _hashed(file.resolve(), file.stat().st_size, file.stat().st_mtime_ns) for file in files
+    }
     if len(files) == 1:
-        return hashes[0]
-    lines = sorted((file.name, digest) for file, digest in zip(files, hashes, strict=True))
-    return hashlib.sha256("".join(f"{digest}  {name}\n" for name, digest in lines).encode()).hexdigest()
+        return hashes[files[0].name]
+    lines = "".join(f"{digest}  {name}\n" for name, digest in sorted(hashes.items()))
+    return hashlib.sha256(lines.encode()).hexdigest()
 
 
 @cache  # some files have gigabytes, and several metrics of every job of a sweep need the hash

@@ -119,9 +119,7 @@ def test_the_record_says_how_a_number_came_about(make, measurand, clip_folder):
         "fov_y_deg": 40.0,
         "size": 48,
         "background": [1.0, 1.0, 1.0],
-        "crop": "none",
         "text": "a view of {}",
-        "aggregation": "mean",
     }
     assert record["model"] == str(clip_folder)
     assert record["revision"] is None
@@ -137,14 +135,6 @@ def test_the_interval_of_a_mean_is_that_of_student(make, measurand):
     record = make(ClipScore).measure(measurand).details["clip_score"]
     known = ttest_1samp(record["views"], 0).confidence_interval(0.95)
     assert (record["interval"]["low"], record["interval"]["high"]) == pytest.approx(tuple(known))
-
-
-def test_the_best_view_counts_if_the_protocol_says_so(make, measurand):
-    best = make(ClipScore, protocol=replace(PROTOCOL, aggregation="best")).measure(measurand)
-    record = best.details["clip_score"]
-    assert best.numbers["clip_score"] == max(record["views"])
-    assert record["mean"] < max(record["views"])
-    assert record["interval"] is None
 
 
 def test_several_metrics_load_a_model_once(make, measurand, candidates, tmp_path, clip_folder, monkeypatch):

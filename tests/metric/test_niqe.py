@@ -29,8 +29,8 @@ def protocol(size=192, views=2):
     return ring(views=views, size=size)
 
 
-def metric(parameters=None, plain_blocks="keep", **changes):
-    return Niqe(protocol=protocol(**changes), parameters=parameters, plain_blocks=plain_blocks)
+def metric(parameters=None, **changes):
+    return Niqe(protocol=protocol(**changes), parameters=parameters)
 
 
 def showing(*pictures):
@@ -54,9 +54,7 @@ def pristine():
 
 
 def ours(image, pristine):
-    return natural.distance(
-        natural.block_features(natural.luma(image / 255), pristine.window), pristine, keep_flat=True
-    )
+    return natural.distance(image / 255, pristine)
 
 
 @pytest.mark.oracle
@@ -108,21 +106,6 @@ def test_the_luma_is_that_of_bt_601():
 
 def test_a_plain_image_has_no_number(pristine):
     assert np.isnan(ours(np.full((200, 200, 3), 180), pristine))
-
-
-def test_with_plain_blocks_left_out_the_amount_of_background_does_not_matter():
-    small, large = torch.ones(288, 288, 3), torch.ones(384, 384, 3)
-    for canvas in (small, large):
-        canvas[40:232, 40:232] = picture("chelsea as it is")
-    numbers = {
-        choice: [
-            metric(plain_blocks=choice, size=len(image), views=1).measure(showing(image)).numbers["niqe"]
-            for image in (small, large)
-        ]
-        for choice in ("keep", "drop")
-    }
-    assert numbers["drop"][0] == pytest.approx(numbers["drop"][1], abs=1e-6)
-    assert abs(numbers["keep"][0] - numbers["keep"][1]) > 0.5
 
 
 def test_the_number_is_the_mean_of_the_views_and_its_record_names_the_parameters(pristine):

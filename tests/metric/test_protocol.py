@@ -1,4 +1,4 @@
-"""Protocols: where the cameras are, what is cropped, and how the values of views become one number."""
+"""Protocols: where the cameras are, and how the values of views become one number."""
 
 from dataclasses import replace
 
@@ -15,11 +15,10 @@ PICTURES = {
     "fov_y_deg": 60.0,
     "size": 40,
     "background": [0.0, 0.0, 1.0],
-    "crop": "none",
     "text": "{}",
     "models": {},
 }
-RING = RingProtocol(**PICTURES, name="ring", views=4, elevations_deg=[0.0, 30.0], aggregation="mean")
+RING = RingProtocol(**PICTURES, name="ring", views=4, elevations_deg=[0.0, 30.0])
 SPHERE = SphereProtocol(**PICTURES, name="sphere", subdivisions=1, other_fovs_y_deg=[45.0, 30.0], rounds=3)
 
 
@@ -70,42 +69,9 @@ def test_smoothing_is_repeated_averages_over_neighbours():
     assert SPHERE.aggregate(values, less_is_better=False) == pytest.approx(max(scores))
 
 
-def disc_at(row, column, radius):
-    """Return a function that renders a red disc on the background of the protocol."""
-
-    def render(cameras, background, shown=None):
-        y, x = torch.meshgrid(torch.arange(40), torch.arange(40), indexing="ij")
-        alpha = ((x - column) ** 2 + (y - row) ** 2 < radius**2).float().expand(len(cameras), 40, 40)
-        red = torch.tensor([1.0, 0.0, 0.0])
-        rgb = alpha[..., None] * red + (1 - alpha[..., None]) * background[:, None, None]
-        return output(rgb, alpha)
-
-    return render
-
-
-@pytest.mark.parametrize("place", [(20, 20), (8, 30), (2, 2)])
-def test_a_cropped_object_is_in_the_middle_and_fills_the_picture(place):
-    cropped = replace(RING, crop="object")
-    for images in cropped.images(disc_at(*place, 6)):
-        assert images.shape == (4, 40, 40, 3)
-        red = images[..., 0] > 0.5
-        rows = red.any(dim=2).nonzero()[:, 1]
-        assert 28 <= rows.max() - rows.min() + 1 <= 36
-        assert (images[:, 0, 0] - torch.tensor([0.0, 0.0, 1.0])).abs().max() < 0.05
-        if place != (2, 2):  # most of this disc is outside the picture
-            middle = (rows.max() + rows.min()) / 2
-            assert 18.5 <= middle <= 20.5
-
-
-def test_without_a_crop_the_pictures_are_those_of_the_renderer():
-    render = disc_at(8, 30, 6)
-    [first, _] = RING.images(render)
-    assert torch.equal(first, render(RING.cameras.index(slice(0, 4)), RING.backgrounds(4)).rgb)
-
-
-def test_a_picture_without_an_object_is_not_cropped():
-    empty = disc_at(8, 30, 0)
-    assert all((images[..., 2] == 1).all() for images in replace(RING, crop="object").images(empty))
+def test_the_pictures_are_those_of_the_renderer():
+    pictures = torch.rand(4, 40, 40, 3, generator=torch.Generator().manual_seed(0))
+    assert all(torch.equal(images, pictures) for images in RING.images(lambda *_: output(pictures)))
 
 
 @pytest.mark.parametrize(
@@ -113,8 +79,6 @@ def test_a_picture_without_an_object_is_not_cropped():
     [
         ({"text": "no place"}, "protocol.text"),
         ({"text": "{} and {}"}, "protocol.text"),
-        ({"crop": "some"}, "protocol.crop"),
-        ({"aggregation": "median"}, "protocol.aggregation"),
         ({"views": 0}, "protocol.views"),
         ({"elevations_deg": []}, "protocol.elevations_deg"),
     ],

@@ -102,8 +102,7 @@ def shares(folder):
 
 def metric(folder, **changes):
     settings = {"protocol": PROTOCOL, "model": str(folder), "revision": None, "question": QUESTION}
-    settings |= {"template": None, "normalize": False, "dtype": "float32"}
-    return Vqa(**settings | changes)
+    return Vqa(**settings | {"dtype": "float32"} | changes)
 
 
 def columns(words):
@@ -126,27 +125,14 @@ def test_the_number_is_the_probability_of_all_spellings_of_yes(folder, shares):
     assert json.loads(json.dumps(record)) == record
 
 
-def test_it_can_be_normalized_against_no(folder, shares):
-    found = metric(folder, normalize=True).measure(MEASURAND).details["vqa"]["views"]
-    yes, no = (shares(CHATTED)[:, columns(words)].sum(dim=1) for words in (YES, NO))
-    assert found == pytest.approx((yes / (yes + no)).tolist(), abs=1e-5)
-
-
-def test_question_and_template_can_be_replaced(folder, shares):
-    changed = metric(folder, question="Does this show {}?", template="<image> {} ASSISTANT:")
-    found = changed.measure(MEASURAND).details["vqa"]["views"]
-    expected = shares("<image> Does this show a red cube? ASSISTANT:")[:, columns(YES)].sum(dim=1)
+def test_the_question_can_be_replaced(folder, shares):
+    found = metric(folder, question="Does this show {}?").measure(MEASURAND).details["vqa"]["views"]
+    expected = shares("USER: <image> Does this show a red cube? ASSISTANT:")[:, columns(YES)].sum(dim=1)
     assert found == pytest.approx(expected.tolist(), abs=1e-5)
 
 
-def refusal(folder, **changes):
-    with pytest.raises(UserError) as caught:
-        metric(folder, **changes).measure(MEASURAND)
-    return str(caught.value)
-
-
-def test_a_model_without_a_chat_template_needs_a_template(folder, tmp_path, shares):
+def test_a_model_without_a_chat_template_is_refused(folder, tmp_path):
     bare = shutil.copytree(folder, tmp_path / "bare")
     (bare / "chat_template.jinja").unlink()
-    assert refusal(bare).startswith("metric.vqa.template: expected a text")
-    metric(bare, template="<image>{}").measure(MEASURAND)
+    with pytest.raises(UserError, match="it has no chat template"):
+        metric(bare).prepare()
