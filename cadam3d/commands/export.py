@@ -10,8 +10,7 @@ from cadam3d.commands.messages import note
 from cadam3d.commands.opened import OpenedAsset, open_asset, renderer
 from cadam3d.commands.writing import Output, chosen_exporters, run_exporters, write_files
 from cadam3d.core.errors import UserError
-from cadam3d.exporter.base import Contents, Exporter
-from cadam3d.exporter.programs import UPSIDE_DOWN, shown_as
+from cadam3d.exporter.base import Exporter
 from cadam3d.io.asset_record import FileEntry, axes_of, facts_of, require_own_record, sha256_of, write_record
 from cadam3d.io.lock import taking_turns
 from cadam3d.io.run_folder import (
@@ -25,8 +24,6 @@ from cadam3d.io.run_folder import (
     typed_path,
 )
 from cadam3d.settings.compose import Call, escape
-
-INDENT = "  "
 
 
 def run(cfg: DictConfig, _call: Call) -> None:
@@ -73,8 +70,24 @@ def export(cfg: DictConfig, asset: OpenedAsset, name: str, *, has_record: bool) 
 
 def recorded(folder: Path, asset: OpenedAsset, outputs: Sequence[Output]) -> list[Output]:
     """Describe the files of the asset itself in asset.json and return it, unless there are only pictures."""
-    contents = [(output, contents_of(output, asset)) for output in outputs]
-    entries = [entry_of(output, found) for output, found in contents if found is not None]
+    entries = []
+    for output in outputs:
+        exporter, path = output.exporter, output.path
+        contents = None if exporter is None else exporter.contents(path, asset.gaussians)
+        if contents is None:
+            continue
+        entries.append(
+            FileEntry(
+                name=path.name,
+                format=output.name,
+                bytes=path.stat().st_size,
+                sha256=sha256_of(path),
+                frame=None if contents.up is None else axes_of(contents.up),
+                sh_degree=contents.sh_degree,
+                gaussians=contents.gaussians,
+                triangles=contents.triangles,
+            )
+        )
     if not entries:
         return []
     source = {
@@ -111,53 +124,15 @@ def require_apart(asset: OpenedAsset, paths: Sequence[Path]) -> None:
         )
 
 
-def contents_of(output: Output, asset: OpenedAsset) -> Contents | None:
-    """Return what a file holds of the asset; None for a picture."""
-    return None if output.exporter is None else output.exporter.contents(output.path, asset.gaussians)
-
-
-def entry_of(output: Output, contents: Contents) -> FileEntry:
-    """Return the description of a file for asset.json."""
-    return FileEntry(
-        name=output.path.name,
-        format=output.name,
-        bytes=output.path.stat().st_size,
-        sha256=sha256_of(output.path),
-        frame=None if contents.up is None else axes_of(contents.up),
-        sh_degree=contents.sh_degree,
-        gaussians=contents.gaussians,
-        triangles=contents.triangles,
-    )
-
-
 def described(output: Output, asset: OpenedAsset) -> list[str]:
-    """Return the lines that are printed about a file: its content, and how other programs show it."""
-    first = f"{shown(output.path)}  {size_in_words(output.path.stat().st_size)}"
-    exporter, contents = output.exporter, contents_of(output, asset)
+    """Return the lines that are printed about a file: its size and content, and what the format loses."""
+    first = f"{shown(output.path)}  {output.path.stat().st_size / 1e6:,.3f} MB"
+    exporter = output.exporter
     if exporter is None:
         return [f"{first}, describes these files"]
+    contents = exporter.contents(output.path, asset.gaussians)
     if contents is None:
         return [first]
-    first = f"{first}, {contents.words}"
-    if contents.gaussians is None and contents.triangles is None:
-        return [first]
+    up = "" if contents.up is None else f", {contents.up} up"
     notes = [exporter.losses(asset.gaussians.sh_degree), exporter.hint]
-    if contents.up is not None:
-        first = f"{first}, {contents.up} up"
-        kind = f"{output.name}.{exporter.variant}" if exporter.variant else output.name
-        notes = [*views_in_words(kind, contents.up), *notes]
-    return [first, *(INDENT + text for text in notes if text)]
-
-
-def views_in_words(exporter: str, up: str) -> list[str]:
-    """Return in which programs a file is upright, and in which upside down (with the ``for=`` that helps)."""
-    lines = []
-    for way, programs in shown_as(exporter, up).items():
-        names = [f"{each.name} (for={each.target})" if way == UPSIDE_DOWN else each.name for each in programs]
-        lines += [f"{way} in {', '.join(names)}"] if names else []
-    return lines
-
-
-def size_in_words(size: int) -> str:
-    """Return a number of bytes in MB, or in kB if that is more exact."""
-    return f"{size / 1e6:,.2f} MB" if size >= 100_000 else f"{size / 1e3:.1f} kB"
+    return [f"{first}, {contents.words}{up}", *(f"  {text}" for text in notes if text)]

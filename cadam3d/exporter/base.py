@@ -68,11 +68,6 @@ class Exporter(ABC):
         wanted = f".{getattr(self, self.suffix_setting)}"
         return next(name for name in self.files if suffix_in(name) == wanted)
 
-    @property
-    def variant(self) -> str:
-        """Return the variant of the format, which programs may show differently; "" is the usual one."""
-        return ""
-
     def contents(self, path: Path, gaussians: Gaussians) -> Contents | None:
         """Return what a file holds that ``export`` has written; None for a picture."""
         return None

@@ -46,11 +46,6 @@ class MeshExporter(SurfaceSettings, Exporter):
             )
         require_xatlas()
 
-    @property
-    def variant(self) -> str:
-        """Return the format if it is not glb, because obj and ply do not define their axes."""
-        return "" if self.format == "glb" else self.format
-
     def most_triangles(self) -> int | None:
         """Return the most triangles that the surface may have.
 

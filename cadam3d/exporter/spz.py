@@ -28,11 +28,6 @@ class SpzExporter(AssetExporter):
         if self.version == 4:
             require_gaussforge("exporter.spz.version")
 
-    @property
-    def variant(self) -> str:
-        """Return the version if it is 4, which fewer programs read."""
-        return "" if self.version == 3 else str(self.version)
-
     def write(self, path: Path, gaussians: Gaussians) -> None:
         """Write the file atomically. Raises ``UserError`` if it cannot be written."""
         write = write_spz4 if self.version == 4 else write_spz

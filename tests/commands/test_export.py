@@ -14,7 +14,6 @@ from splats import make_gaussians
 import cadam3d
 from cadam3d.core.errors import UserError
 from cadam3d.exporter.base import suffix_in
-from cadam3d.exporter.programs import PROGRAMS, UPRIGHT, shown_as
 from cadam3d.io.asset_file import read_gaussians
 from cadam3d.io.asset_record import axes_of
 from cadam3d.io.frames import AXES, UPS
@@ -246,52 +245,33 @@ def test_two_exports_into_one_folder_take_turns(tmp_path):
 # --- for= -------------------------------------------------------------------------------------------------
 
 
-def test_every_target_is_a_program_with_known_axes():
-    assert sorted(program.target for program in PROGRAMS) == TARGETS
-    for program in PROGRAMS:
-        assert program.source
-        assert program.version
-        assert set(program.upright) <= CLASSES.keys()
-        assert set(program.upright.values()) <= set(UPS)
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_the_table_states_what_the_tests_with_other_programs_measure(name):
-    [program] = [program for program in PROGRAMS if program.name == name]
-    assert program.is_measured
-    measured = {case.exporter: case.upright for case in CASES[name]}
-    assert measured
-    assert measured.items() <= program.upright.items()
-
-
-def test_the_page_about_exporting_has_every_program_and_its_version():
+def row_of(target: str) -> str:
+    """Return the line of docs/exporting.md about a program."""
     page = (Path(cadam3d.__file__).parent.parent / "docs/exporting.md").read_text(encoding="utf-8")
-    for program in PROGRAMS:
-        [row] = [line for line in page.splitlines() if line.startswith(f"| {program.name} |")]
-        [(name, node)] = compose([f"for={program.target}"], "export").exporter.items()
-        assert f"`for={program.target}` | `{CLASSES[name].files[0]}`" in row
-        assert f"{node.up} up" in row or name == "mesh"
-        assert program.version.split()[-1] in row
-        assert ("measured: " if program.is_measured else "documented: ") in row
+    [row] = [line for line in page.splitlines() if f"| `for={target}` |" in line]
+    return row
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_a_target_chooses_an_exporter_whose_file_is_upright_there(target, run_folder, type_line):
-    [program] = [program for program in PROGRAMS if program.target == target]
-    chosen = compose([f"for={target}"], "export").exporter
-    [(name, node)] = chosen.items()
-    assert program.upright[name] == node.up
-    code, out, _ = type_line("export", f"run={run_folder}", f"for={target}", "device=cpu")
+def test_a_target_writes_a_file_that_is_upright_there(target):
+    """The page says so, and for most programs the tests with these programs have measured it."""
+    [(name, node)] = compose([f"for={target}"], "export").exporter.items()
+    row = row_of(target)
+    assert f"`{CLASSES[name].files[0]}`" in row
+    assert f"{node.up} up" in row or name == "mesh"
+    measured = [case for case in CASES.get(row.split("|")[1].strip(), ()) if case.exporter == name]
+    assert {case.upright for case in measured} <= {node.up}
+
+
+@pytest.mark.parametrize("target", ["three", "spark", "blender"])
+def test_a_target_chooses_an_exporter_and_its_axes(target, run_folder, type_line):
+    [(name, node)] = compose([f"for={target}"], "export").exporter.items()
+    words = ["exporter.mesh.resolution=16", "exporter.mesh.level=0.1"] if name == "mesh" else []
+    code, out, _ = type_line("export", f"run={run_folder}", f"for={target}", *words)
     assert code == 0
+    assert f", {node.up} up" in out
     [entry] = files_in(run_folder / "exports/asset.json").values()
     assert (entry["format"], entry["frame"]["up"]) == (name, node.up)
-    assert f"upright in {', '.join(each.name for each in shown_as(name, node.up)[UPRIGHT])}" in out
-    if name == "ply":
-        # The comment in the header is ignored, so that the numbers themselves are judged.
-        path = run_folder / "exports/asset.ply"
-        path.write_bytes(path.read_bytes().replace(b"comment cadam3d up=", b"comment somebody up="))
-        means = read_ply(path, up=program.upright["ply"]).means
-        torch.testing.assert_close(means, read_ply(run_folder / "asset.ply").means)
 
 
 def test_a_target_and_an_exporter_are_refused_but_a_setting_of_the_exporter_wins(run_folder, type_line):
@@ -366,25 +346,11 @@ def test_an_exporter_from_elsewhere_is_chosen_by_its_suffix(tmp_path, monkeypatc
 # --- what is printed --------------------------------------------------------------------------------------
 
 
-def test_the_lines_about_a_file_name_its_axes_and_the_programs(run_folder, type_line):
-    first, upright, upside_down, last = type_line(
-        "export", f"run={run_folder}", "output=out"
-    ).out.splitlines()
+def test_the_lines_about_a_file_name_its_size_content_and_axes(run_folder, type_line):
+    first, last = type_line("export", f"run={run_folder}", "output=out").out.splitlines()
     size = Path("out/asset.ply").stat().st_size
-    assert first == f"out/asset.ply  {size / 1e3:.1f} kB, 6 Gaussians, -y up"
-    assert upright.startswith("  upright in SuperSplat, viser")
-    assert upside_down.startswith("  upside down in Spark (for=spark), three.js (for=three)")
+    assert first == f"out/asset.ply  {size / 1e6:.3f} MB, 6 Gaussians, -y up"
     assert last.endswith("describes these files")
-    sideways = type_line("export", f"run={run_folder}", "output=a.ply", "exporter.ply.up=+z").out.splitlines()
-    assert sideways[1].startswith("  on its side in SuperSplat, viser")
-
-
-@pytest.mark.parametrize("exporter", sorted(CLASSES))
-def test_a_program_shows_a_file_in_one_way(exporter):
-    for up in UPS:
-        shown = [program for programs in shown_as(exporter, up).values() for program in programs]
-        assert len(shown) == len(set(map(id, shown)))
-        assert {id(each) for each in shown} == {id(each) for each in PROGRAMS if exporter in each.upright}
 
 
 # --- wrong places -----------------------------------------------------------------------------------------

@@ -96,7 +96,7 @@ def cases(up: str, floors_db: Mapping[str, Sequence[float]]) -> list[Case]:
     ]
 
 
-# The files that programs of ``exporter/programs.py`` show upright. SPZ has a lower floor at SH degree 3,
+# The files that the programs in ``docs/exporting.md`` show upright. SPZ has a lower floor at SH degree 3,
 # because its coefficients have few bits.
 CASES = {
     # Babylon.js takes -y for up, except in glTF, which defines its axes. It needs a network for SPZ and SOG.
