@@ -2,17 +2,17 @@
 
 import sys
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from omegaconf import DictConfig
 
 from cadam3d import report
-from cadam3d.commands.linking import link_best, link_latest
+from cadam3d.commands.beginning import link
 from cadam3d.core.errors import UserError
-from cadam3d.core.number import Number
 from cadam3d.io.jsonl import write_json
-from cadam3d.io.run_folder import ASSET, BEST, CHOICE, REPORT, setting_word, shown
+from cadam3d.io.run_folder import ASSET, BEST, CHOICE, LATEST, REPORT, setting_word, shown
 from cadam3d.sweep.choice import (
     Choice,
     attempt_of,
@@ -44,7 +44,7 @@ def run(
     sweep, numbers = read_attempts(cfg, overrides, options), selectable_numbers(options)
     existing = [attempt_of(row) for row in rows_of(sweep.folder, sweep.jobs)]
     require_measured(select, numbers, list(cfg.get("metric") or ()), existing, sweep.folder)
-    ended = run_sweep(sweep, words, flags, on_start=link_latest)
+    ended = run_sweep(sweep, words, flags, on_start=partial(link, Path(LATEST)))
     if ended.was_dry:
         return ended.code
     rows = load(ended.folder)
@@ -54,11 +54,17 @@ def run(
         require_one_method(choice, rows, ended.folder)
         _keep(choice, ended.folder)
     if not ended.was_stopped:
-        _write_report(ended.folder)
+        try:
+            report.write_sweep(ended.folder)
+        except UserError as error:
+            print(f"cadam3d: {error}", file=sys.stderr)
     if choice is not None:
         _print(choice, ended.folder)
     elif any(attempt.measured for attempt in attempts):
-        raise _nothing_to_choose_by(select, numbers, ended.folder)
+        names = preferred(numbers.values()) if select is None else [select]
+        # The last of several needs no truth.
+        line = measuring_line(ended.folder, numbers[names[-1]])
+        raise UserError(f"select: no attempt has {' or '.join(names)}. Measure them first. Try: {line}")
     return ended.code
 
 
@@ -74,44 +80,14 @@ def _keep(choice: Choice, folder: Path) -> None:
         "why": choice.sentence,
     }
     write_json(folder / CHOICE, facts)
-    try:
-        link_best(folder, name)
-    except OSError as error:
-        raise UserError(
-            f"{shown(folder)}/{BEST}: cannot be written ({error.strerror or error}). {choice.sentence} "
-            f"Try: cadam3d view {setting_word('run', shown(folder / name))}"
-        ) from error
-
-
-def _write_report(folder: Path) -> None:
-    """Write the page that compares the attempts. A failure is printed and does not stop the command."""
-    try:
-        report.write_sweep(folder)
-    except UserError as error:
-        print(f"cadam3d: {error}", file=sys.stderr)
+    link(folder / BEST, folder / name)
 
 
 def _print(choice: Choice, folder: Path) -> None:
     """Print why the best attempt was chosen, where its files are, and what to type next."""
-    # Print the link itself instead of the folder to which it leads.
-    best = shown(folder) / BEST
-    print(f"\n{choice.sentence}\n")
-    print(f"  {'best':<9}{best} -> seed={choice.best}")
-    if (folder / BEST / ASSET).is_file():
-        print(f"  {'asset':<9}{best / ASSET}")
-    if (folder / REPORT).is_file():
-        print(f"  {'report':<9}{shown(folder / REPORT)}")
-    word = setting_word("run", best)
-    print(f"  {'next':<9}cadam3d view {word}\n  {'':<9}cadam3d export {word}", flush=True)
-
-
-def _nothing_to_choose_by(select: str | None, numbers: Mapping[str, Number], folder: Path) -> UserError:
-    """Return the error for attempts of which none has the number to compare by."""
-    names = preferred(numbers.values()) if select is None else [select]
-    wanted = f"one of {', '.join(names)}" if select is None else select
-    # The last of several needs no truth.
-    line = measuring_line(folder, numbers[names[-1]])
-    return UserError(
-        f"select: no attempt has {wanted}. All of them are kept: measure them, and then type the same line "
-        f"again. Try: {line}"
-    )
+    best = folder / f"seed={choice.best}"
+    print(f"\n{choice.sentence}\n\n  {'best':<9}{shown(best)}")
+    for label, path in (("asset", best / ASSET), ("report", folder / REPORT)):
+        if path.is_file():
+            print(f"  {label:<9}{shown(path)}")
+    print(f"  {'next':<9}cadam3d view {setting_word('run', shown(best))}", flush=True)

@@ -9,11 +9,12 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from cadam3d.commands.linking import link_latest
 from cadam3d.commands.messages import note, note_backend
+from cadam3d.core.console import say
 from cadam3d.io.atomic import remove_leftovers, replacing
+from cadam3d.io.links import point
 from cadam3d.io.lock import INHERITED
-from cadam3d.io.run_folder import CONFIG, HYDRA_CONFIG, HYDRA_SETTINGS, LOG, OVERRIDES
+from cadam3d.io.run_folder import CONFIG, HYDRA_CONFIG, HYDRA_SETTINGS, LATEST, LOG, OVERRIDES
 from cadam3d.rasterizer.base import Backend
 from cadam3d.settings.compose import Call
 from cadam3d.state import RunContext, TrainState
@@ -114,8 +115,16 @@ def begun(cfg: DictConfig, call: Call, folder: Path) -> Iterator[str]:
                 temporary.write_text(text, encoding="utf-8")
         # This is for single runs: a sweep locks the folders of its jobs and passes the locks on.
         if INHERITED not in os.environ:
-            link_latest(folder)
+            link(Path(LATEST), folder)
         yield config_text
+
+
+def link(name: Path, folder: Path) -> None:
+    """Make ``name`` a link to ``folder``. If that is not possible, print a note."""
+    try:
+        point(name, folder)
+    except OSError as error:
+        say(f"Note: {name} not updated ({error.strerror}).", logging.WARNING)
 
 
 @contextmanager

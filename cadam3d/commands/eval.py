@@ -2,7 +2,7 @@
 
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.jsonl import write_json
-from cadam3d.io.records import MEASUREMENTS, NUMBERS, psnr_of, read_summary, scores_in, with_earlier
+from cadam3d.io.records import MEASUREMENTS, NUMBERS, psnr_of, read_summary, with_earlier
 from cadam3d.io.run_folder import CONFIG, EVALUATION, LATEST, shown, typed_path
 from cadam3d.metric.base import Measurand
 from cadam3d.prior.base import DiffusionPrior
@@ -27,7 +27,7 @@ from cadam3d.prior.truth import PriorTruth, TruthSource
 from cadam3d.settings.compose import Call
 from cadam3d.settings.trust import read_components, require_contained
 from cadam3d.sweep.folder import is_sweep, load
-from cadam3d.sweep.table import aligned, scores_of, write_table
+from cadam3d.sweep.table import as_text, write_table
 
 
 def run(cfg: DictConfig, call: Call) -> None:
@@ -103,22 +103,14 @@ def _as_text(result: Mapping[str, Any]) -> str:
     missing = {name: "-" for name in records if name not in result}
     lines = []
     for name, value in {**result, **missing}.items():
-        if name not in (MEASUREMENTS, NUMBERS):
-            text = f"{value:.4f}" if isinstance(value, float) else str(value)
-            lines.append(f"{name:<20}{text}   {_explained(records.get(name, {}))}".rstrip())
+        if name in (MEASUREMENTS, NUMBERS):
+            continue
+        record = records.get(name, {})
+        text = f"{value:.4f}" if isinstance(value, float) else str(value)
+        how = [record.get("reason"), record.get("model")]
+        how += [f"protocol={record['protocol']['name']}"] if "protocol" in record else []
+        lines.append(f"{name:<20}{text}   {', '.join(filter(None, how))}".rstrip())
     return "\n".join(lines)
-
-
-def _explained(record: Mapping[str, Any]) -> str:
-    """Return the interval of a number, its protocol and its model, or why it is missing."""
-    parts = [record["reason"]] if "reason" in record else []
-    if interval := record.get("interval"):
-        parts.append(f"{interval['low']:.4f} to {interval['high']:.4f}")
-    if "protocol" in record:
-        parts.append(f"protocol={record['protocol']['name']}")
-    if "model" in record:
-        parts.append(record["model"])
-    return ", ".join(parts)
 
 
 def start_of(components_of: Callable[[tuple[str, ...]], DictConfig], device: torch.device) -> Gaussians:
@@ -151,22 +143,9 @@ def _evaluate_sweep(cfg: DictConfig, call: Call, folder: Path) -> None:
         write_json(job / EVALUATION, results[-1])
     if all("message" in result for result in results):
         raise UserError(f"run: no job of {cfg.run} could be measured, for the reasons above")
-    print(_table(results, folder))
     write_json(folder / EVALUATION, results)
-    write_table(folder)
+    print(f"\n{as_text(write_table(folder))}")
     table = report.write_paper_table(folder)
     print(f"\n{len(results)} jobs: {shown(folder / EVALUATION)}\nreport: {shown(report.write_sweep(folder))}")
     if table:
         print(f"\n{table}")
-
-
-def _table(results: Sequence[Mapping[str, Any]], sweep: Path) -> str:
-    """Return the scores of all jobs and their means; empty if nothing was scored."""
-    scores = scores_of([scores_in(result) for result in results], sweep)
-    if not scores.columns and not scores.left_out:
-        return ""
-    names = [Path(str(result["run"])).name for result in results]
-    known = [[value for value in column if value is not None] for column in scores.columns.values()]
-    means = [sum(values) / len(values) for values in known]
-    lines = [["job", *scores.columns], *zip(names, *scores.columns.values(), strict=True), ["mean", *means]]
-    return "\n".join(["", aligned(lines), *scores.left_out])

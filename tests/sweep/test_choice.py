@@ -9,8 +9,6 @@ import pytest
 from declarations import all_numbers, declared
 
 from cadam3d import cli
-from cadam3d.commands.linking import link_best
-from cadam3d.io import links
 from cadam3d.settings import compose as settings
 from cadam3d.settings import options
 from cadam3d.sweep import start
@@ -167,7 +165,7 @@ def test_every_attempt_is_kept_and_the_best_is_linked(train):
     assert (choice["best"], choice["select"]) == ("seed=1", "psnr")
     assert choice["values"] == {"seed=1": 23.5, "seed=3": 23.5, "seed=2": 22.25, "seed=0": 21.0}
     assert f"\n{choice['why']}\n" in out
-    assert f"cadam3d view run={folder}/best\n" in out
+    assert f"cadam3d view run={folder}/seed=1\n" in out
 
 
 def test_the_same_line_trains_only_what_is_left(train, calls):
@@ -300,23 +298,6 @@ def test_the_folder_of_a_run_and_one_with_a_file_called_best_are_refused(train):
     code, _, err = train(*LINE, "hydra.run.dir=mine")
     assert code == 1
     assert err == "cadam3d: hydra.run.dir: mine holds best. Try: hydra.run.dir=mine-2\n"
-
-
-def test_without_links_the_best_is_a_copy_and_an_earlier_copy_is_kept(tmp_path, monkeypatch):
-    def refuse(*_: object) -> None:
-        raise OSError(1, "Operation not permitted")
-
-    monkeypatch.setattr(links.Path, "symlink_to", refuse)
-    for seed in range(2):
-        (tmp_path / f"seed={seed}").mkdir()
-        (tmp_path / f"seed={seed}" / "summary.json").write_text(f'{{"seed": {seed}}}')
-    link_best(tmp_path, "seed=0")
-    (tmp_path / "best" / "mine.txt").touch()
-    link_best(tmp_path, "seed=0")
-    assert (tmp_path / "best" / "mine.txt").exists()
-    link_best(tmp_path, "seed=1")
-    assert json.loads((tmp_path / "best" / "summary.json").read_text()) == {"seed": 1}
-    assert (tmp_path / "best-2" / "mine.txt").exists()
 
 
 def test_attempts_that_are_trusted_have_the_folder_that_they_had(train):
