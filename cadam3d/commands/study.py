@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -34,12 +34,12 @@ from cadam3d.io.run_folder import (
 )
 from cadam3d.report.formatting import plural
 from cadam3d.settings.compose import Call
-from cadam3d.study.answers import AnswerFile, collect, find_files, read_files
-from cadam3d.study.clips import LEAST_VISIBLE, ClipSettings, FilmedTurn, film, ruined
-from cadam3d.study.key import KEY, PAGE, RESULTS, TABLE, Key, read_key, write_key
+from cadam3d.study.answers import collect, find_files, read_files
+from cadam3d.study.clips import LEAST_VISIBLE, ClipSettings, film, ruined
+from cadam3d.study.key import KEY, PAGE, RESULTS, TABLE, read_key, write_key
 from cadam3d.study.rater_page import study_id, study_page
 from cadam3d.study.runs import RunPair, StudyRun, draw_pairs, find_runs, pair_runs, select
-from cadam3d.study.trials import StudyPlan, catch_count, make_plan
+from cadam3d.study.trials import catch_count, make_plan
 
 LARGEST_CONSENT = 1 << 16  # bytes
 CONSENT = """Taking part is voluntary, and you can stop at any time without giving a reason.
@@ -59,19 +59,16 @@ def run(cfg: DictConfig, _call: Call) -> None:
         _evaluate(cfg)
 
 
-# The page.
-
-
 def _write(cfg: DictConfig) -> None:
     """Write ``study.html`` and ``key.json`` into ``output``, and print what they contain."""
     settings = _settings(cfg)
     # The text that raters read before they begin.
     consent = CONSENT if cfg.consent is None else read_text(expanded(cfg.consent), largest=LARGEST_CONSENT)
     pairs = _pairs(cfg)
-    runs = list(dict.fromkeys(run for pair in pairs for run in pair.runs))
     # A rater may know this program and guess the seed. The draws also depend on the assets, which a page does
     # not contain, so that they cannot be repeated from it.
-    generator = Random(f"{cfg.seed} {' '.join(sha256_of(run.folder / ASSET) for run in runs)}")
+    hashes = (sha256_of(run.folder / ASSET) for run in _runs_in(pairs))
+    generator = Random(f"{cfg.seed} {' '.join(hashes)}")
     pairs = draw_pairs(pairs, cfg.pairs, generator)
     folder = typed_path(cfg.output)
     # Without its key, the answers to a study are lost.
@@ -84,6 +81,11 @@ def _write(cfg: DictConfig) -> None:
         _write_page(cfg, settings, consent, pairs, generator, folder)
     finally:
         remove_empty(folder, existing)
+
+
+def _runs_in(pairs: Sequence[RunPair]) -> list[StudyRun]:
+    """Return every run of the pairs once."""
+    return list(dict.fromkeys(run for pair in pairs for run in pair.runs))
 
 
 def _settings(cfg: DictConfig) -> ClipSettings:
@@ -109,9 +111,9 @@ def _pairs(cfg: DictConfig) -> list[RunPair]:
     prompts = None if cfg.prompts is None else {each.text for each in read_prompts(str(cfg.prompts))}
     runs = select(found, None if cfg.arms is None else _texts(cfg.arms), prompts)
     pairs = pair_runs(runs, same_seed=cfg.same_seed)
-    paired = {run for pair in pairs for run in pair.runs}
-    if single := [str(shown(run.folder)) for run in runs if run not in paired]:
-        note(f"{plural(len(single), 'run')} without a partner in another arm, such as {single[0]}")
+    if single := set(runs) - set(_runs_in(pairs)):
+        example = min(str(shown(run.folder)) for run in single)
+        note(f"{len(single)} run(s) without a partner in another arm, such as {example}")
     return pairs
 
 
@@ -123,8 +125,18 @@ def _write_page(
     generator: Random,
     folder: Path,
 ) -> None:
-    clips = _film_all(pairs, cfg, settings)
-    plan = _plan(cfg, pairs, clips, generator)
+    runs = _runs_in(pairs)
+    clips = {}
+    for number, each in enumerate(runs, 1):
+        say(f"turntable {number} of {len(runs)}")
+        gaussians = open_run(each.folder, cfg.device).gaussians
+        clips[each] = film(renderer(cfg.rasterizer, gaussians), settings)
+    catches = catch_count(len(pairs), cfg.catch_share)
+    visible = [run for run, clip in clips.items() if clip.visible >= LEAST_VISIBLE]
+    if catches and not visible:
+        expected = "a colour in front of which the objects can be seen"
+        raise fail("backdrop", expected=expected, got=list(cfg.backdrop), example="'backdrop=[0.5,0.5,0.5]'")
+    plan = make_plan(pairs, visible, catches, generator)
     frames = [
         ruined(clips[source.run], settings, number) if source.is_ruined else clips[source.run].frames
         for number, source in enumerate(plan.sources)
@@ -136,38 +148,10 @@ def _write_page(
     write_key(folder / KEY, study, plan, seed=cfg.seed)
     for (one, other), count in sorted(Counter(pair.arms for pair in pairs).items()):
         print(f"{one} and {other}: {plural(count, 'pair')}")
-    trials, catches = plural(len(plan.trials), "trial"), len(plan.trials) - len(pairs)
+    trials = plural(len(plan.trials), "trial")
     print(f"{trials}, of which {plural(catches, 'catch trial')}; {len(page) / 1e6:.1f} MB")
     print(f"for the raters:  {shown(folder / PAGE)}")
     print(f"keep it secret:  {shown(folder / KEY)}")
-
-
-def _film_all(
-    pairs: Sequence[RunPair], cfg: DictConfig, settings: ClipSettings
-) -> dict[StudyRun, FilmedTurn]:
-    """Return a clip of every run, rendered in the same way."""
-    runs = list(dict.fromkeys(run for pair in pairs for run in pair.runs))
-    clips = {}
-    for number, each in enumerate(runs, 1):
-        say(f"turntable {number} of {len(runs)}")
-        gaussians = open_run(each.folder, cfg.device).gaussians
-        clips[each] = film(renderer(cfg.rasterizer, gaussians), settings)
-    return clips
-
-
-def _plan(
-    cfg: DictConfig, pairs: Sequence[RunPair], clips: Mapping[StudyRun, FilmedTurn], generator: Random
-) -> StudyPlan:
-    """Return the trials. Raises ``UserError`` if no clip shows enough for a catch trial."""
-    catches = catch_count(len(pairs), cfg.catch_share)
-    visible = [run for run, clip in clips.items() if clip.visible >= LEAST_VISIBLE]
-    if catches and not visible:
-        expected = "a colour in front of which the objects can be seen"
-        raise fail("backdrop", expected=expected, got=list(cfg.backdrop), example="'backdrop=[0.5,0.5,0.5]'")
-    return make_plan(pairs, visible, catches, generator)
-
-
-# The answers.
 
 
 def _evaluate(cfg: DictConfig) -> None:
@@ -177,13 +161,17 @@ def _evaluate(cfg: DictConfig) -> None:
 
     require_range("least_caught", cfg.least_caught, low=0, high=1)
     files, left = read_files(find_files(_texts(cfg.answers)))
-    listed = _reported(left)
-    place, key = _find_key(cfg, files)
-    raters, left = collect(files, key)
-    listed += _reported(left)
+    path = expanded(cfg.output if cfg.key is None else cfg.key)
+    key = read_key(path := path / KEY if path.is_dir() else path)
+    raters, others = collect(files, key)
+    left |= others
+    for file, reason in left.items():
+        say(plain(f"Warning: {shown(file)} is left out: {reason}"))
+    listed = [{"file": plain(file.name), "reason": plain(reason)} for file, reason in left.items()]
     analysis = analyse(raters, least_caught=float(cfg.least_caught))
     page = markdown(analysis)
     print(page)
+    place = path.parent
     facts = {"study": key.study, "catch_trials": key.catch_trials, "trials": len(key.trials)}
     write_json(place / RESULTS, {"kind": "study results", **facts, "left_out": listed, **analysis.to_json()})
     if listed:
@@ -192,28 +180,6 @@ def _evaluate(cfg: DictConfig) -> None:
     with replacing(place / TABLE) as temporary:
         temporary.write_text(page, encoding="utf-8")
     print(f"{shown(place / RESULTS)}, {shown(place / TABLE)}")
-
-
-def _reported(left: Mapping[Path, str]) -> list[dict[str, str]]:
-    """Print a warning for each file that is left out, and return the entries of ``study.json`` about them."""
-    for path, reason in left.items():
-        say(plain(f"Warning: {shown(path)} is left out: {reason}"))
-    return [{"file": plain(path.name), "reason": plain(reason)} for path, reason in left.items()]
-
-
-def _find_key(cfg: DictConfig, files: Mapping[Path, AnswerFile]) -> tuple[Path, Key]:
-    """Return the folder of the key of the study that the files are about, and the key."""
-    if cfg.key is not None:
-        path = expanded(cfg.key)
-        path = path / KEY if path.is_dir() else path
-        return path.parent, read_key(path)
-    around = [folder for path in files for folder in list(path.absolute().parents)[:2]]
-    studies = {file.study for file in files.values()}
-    for folder in dict.fromkeys([expanded(cfg.output), *around]):
-        if (folder / KEY).is_file() and (key := read_key(folder / KEY)).study in studies:
-            return folder, key
-    expected = f"the key of the study in {cfg.output}/, beside the answers or in the folder above"
-    raise fail("key", expected=expected, got=None, example="key=FILE")
 
 
 def _texts(value: Any) -> list[str]:
