@@ -29,7 +29,6 @@ github.com/sparkjsdev/spark (both layouts); and measurements. splat-transform 3.
 here the same numbers as this module, to the bit, and the other way round.
 """
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -45,9 +44,11 @@ from cadam3d.io.encoding import (
     as_tensor,
     byte_logits,
     in_file_axes,
+    is_finite,
     opacities,
-    to_bytes,
+    smallest_three,
     unit_quats,
+    with_largest,
 )
 from cadam3d.io.frames import UPS
 from cadam3d.io.gathering import gathered
@@ -56,10 +57,14 @@ from cadam3d.io.ply_tables import PlyHeader, columns, header_text, read_header, 
 from cadam3d.io.reading import unusable
 
 CHUNK_ROWS = 256
-POSITION_BOUNDS = ["min_x", "min_y", "min_z", "max_x", "max_y", "max_z"]
-SCALE_BOUNDS = [f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"]
-# Files of SuperSplat 1 do not have them.
-COLOR_BOUNDS = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"]
+# The bounds of positions, scales and colours. Files of SuperSplat 1 do not have those of colours.
+BOUNDS = [
+    f"{end}_{kind}{axis}"
+    for kind, axes in (("", "xyz"), ("scale_", "xyz"), ("", "rgb"))
+    for end in ("min", "max")
+    for axis in axes
+]
+COLOR_BOUNDS = BOUNDS[12:]
 PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 VECTOR_BITS = (11, 10, 11)
 COLOR_BITS = (8, 8, 8, 8)
@@ -76,42 +81,40 @@ def write_compressed_ply(path: Path, gaussians: Gaussians, *, up: str) -> None:
     is NaN or infinite.
     """
     local = in_file_axes(gaussians, up)
-    _require_finite(path, local)
+    if not is_finite(local):
+        raise UserError(f"{path}: expected finite numbers, got NaN or infinity. Try: 'exporter=[ply]'")
     local = local.index(torch.from_numpy(morton_order(local.means.numpy())))
-    starts = range(0, len(local), CHUNK_ROWS)
-    positions = local.means.numpy()
     scales = np.clip(local.log_scales.numpy(), -LARGEST_LOG_SCALE, LARGEST_LOG_SCALE)
     colors = np.float32(0.5) + np.float32(SH_C0) * local.sh[:, 0].numpy()
+    values = np.concatenate([local.means.numpy(), scales, colors], axis=1)
 
-    bounds = np.zeros((len(starts), 18), dtype="<f4")
-    words = np.zeros((len(local), len(PACKED)), dtype="<u4")
-    words[:, 1] = _packed_rotations(unit_quats(local))
-    alphas = to_bytes(255 * opacities(local))
-    for chunk, start in enumerate(starts):
-        rows = slice(start, start + CHUNK_ROWS)
-        shares = []
-        for block, values in enumerate((positions, scales, colors)):
-            low, high = values[rows].min(axis=0), values[rows].max(axis=0)
-            bounds[chunk, 6 * block : 6 * block + 6] = [*low, *high]
-            shares.append(_shares(values[rows], low, high))
-        words[rows, 0] = _packed(shares[0], VECTOR_BITS)
-        words[rows, 2] = _packed(shares[1], VECTOR_BITS)
-        words[rows, 3] = _packed(shares[2], (8, 8, 8)) << 8 | alphas[rows]
+    starts = np.arange(0, len(local), CHUNK_ROWS)
+    low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+    bounds = np.stack([low.reshape(-1, 3, 3), high.reshape(-1, 3, 3)], axis=2)
+    chunk = np.arange(len(local)) // CHUNK_ROWS
+    shares = _shares(values, low[chunk], high[chunk])
+    alphas = opacities(local)[:, None]
+    largest, others = smallest_three(unit_quats(local))
+    turns = _packed(others / (2 * LARGEST_OF_SMALLEST) + 0.5, ROTATION_BITS)
+    words = [
+        _packed(shares[:, :3], VECTOR_BITS),
+        largest.astype(np.uint32) << 30 | turns,
+        _packed(shares[:, 3:6], VECTOR_BITS),
+        _packed(np.concatenate([shares[:, 6:], alphas], axis=1), COLOR_BITS),
+    ]
 
     size = REST_SIZES[local.sh_degree]
-    rest = local.sh[:, 1:].numpy().transpose(0, 2, 1).reshape(len(local), size)
+    rest = local.sh[:, 1:].double().numpy().transpose(0, 2, 1)
+    rest_bytes = np.clip(np.floor((rest / SH_RANGE + 0.5) * 256), 0, 255).astype(np.uint8)
     elements = {
-        "chunk": (
-            len(starts),
-            [f"float {name}" for name in (*POSITION_BOUNDS, *SCALE_BOUNDS, *COLOR_BOUNDS)],
-        ),
+        "chunk": (len(starts), [f"float {name}" for name in BOUNDS]),
         VERTEX: (len(local), [f"uint {name}" for name in PACKED]),
     }
     if size:
         elements["sh"] = (len(local), [f"uchar f_rest_{i}" for i in range(size)])
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(header_text(up, elements))
-        for block in (bounds, words, _sh_bytes(rest)):
+        for block in (bounds.astype("<f4"), np.stack(words, axis=1).astype("<u4"), rest_bytes):
             file.write(block.tobytes())
 
 
@@ -127,66 +130,54 @@ def read_compressed_ply(path: Path, *, up: str = "-y") -> Gaussians:
     rest_names = [f"f_rest_{i}" for i in range(size)]
     chunk = header.element("chunk")
     has_colors = chunk is not None and set(COLOR_BOUNDS) <= set(chunk.names)
-    limits = [*POSITION_BOUNDS, *SCALE_BOUNDS, *(COLOR_BOUNDS if has_colors else [])]
+    limits = BOUNDS if has_colors else BOUNDS[:12]
     wanted = {"chunk": limits, VERTEX: PACKED} | ({"sh": rest_names} if size else {})
     tables = read_tables(header, wanted)
     vertices, count = tables[VERTEX], len(tables[VERTEX])
-    _require_layout(path, tables, rest_names)
-    chunks = columns(tables["chunk"], limits)
+    rest = tables["sh"] if size else np.zeros(count)
+    kinds = {vertices.dtype[name].str[1:] for name in PACKED}
+    rest_kinds = {rest.dtype[name].str[1:] for name in rest_names}
+    lengths = (len(tables["chunk"]), len(rest))
+    if kinds != {"u4"} or not rest_kinds <= {"u1"} or lengths != (-(-count // CHUNK_ROWS), count):
+        raise unusable(path, "not a compressed ply: its elements have other types or numbers of rows")
+    # In float64, the difference of two bounds cannot overflow.
+    bounds = columns(tables["chunk"], limits).astype(np.float64)
     if not has_colors:
-        chunks = np.pad(chunks, ((0, 0), (0, 6)))
-        chunks[:, 15:] = 1
+        bounds = np.concatenate(
+            [bounds, np.repeat([[0.0, 1.0]], 3, axis=1).repeat(len(bounds), axis=0)], axis=1
+        )
+    low, high = bounds.reshape(-1, 3, 2, 3).transpose(2, 0, 1, 3).reshape(2, -1, 9)
 
     # Bounds may be infinite, or differ by more than a float32 can hold; both are refused later.
     @np.errstate(over="ignore", invalid="ignore")
     def local(rows: slice) -> Gaussians:
-        some = vertices[rows]
-        # In float64, the difference of two bounds cannot overflow.
-        bounds = chunks[np.arange(count)[rows] // CHUNK_ROWS].astype(np.float64)
-
-        def within(name: str, block: int) -> np.ndarray:
-            shares = _unpacked(some[name], VECTOR_BITS if block < 2 else COLOR_BITS)[:, :3]
-            low, high = bounds[:, 6 * block : 6 * block + 3], bounds[:, 6 * block + 3 : 6 * block + 6]
-            return low + shares * (high - low)
-
-        sh = np.zeros((len(some), 1 + size // 3, 3))
-        sh[:, 0] = (within("packed_color", 2) - 0.5) / SH_C0
-        if rest_names:
-            stored = np.stack([tables["sh"][rows][name] for name in rest_names], axis=1)
-            sh[:, 1:] = _sh_values(stored).reshape(len(some), 3, size // 3).transpose(0, 2, 1)
+        position, rotation, scale, color = (vertices[rows][name] for name in PACKED)
+        channels = _unpacked(color, COLOR_BITS)[:, :3]
+        shares = [_unpacked(position, VECTOR_BITS), _unpacked(scale, VECTOR_BITS), channels]
+        chunk = np.arange(count)[rows] // CHUNK_ROWS
+        values = low[chunk] + np.concatenate(shares, axis=1) * (high[chunk] - low[chunk])
+        others = (_unpacked(rotation, ROTATION_BITS) - 0.5) * (2 * LARGEST_OF_SMALLEST)
+        sh = np.zeros((len(color), 1 + size // 3, 3))
+        sh[:, 0] = (values[:, 6:] - 0.5) / SH_C0
+        if size:
+            stored = np.stack([rest[rows][name] for name in rest_names], axis=1)
+            shares = np.where(stored == 255, 1.0, np.where(stored == 0, 0.0, (stored + 0.5) / 256))
+            sh[:, 1:] = (SH_RANGE * (shares - 0.5)).reshape(len(color), 3, size // 3).transpose(0, 2, 1)
         return Gaussians(
-            means=as_tensor(within("packed_position", 0)),
-            log_scales=as_tensor(within("packed_scale", 1)),
-            quats=as_tensor(_unpacked_rotations(some["packed_rotation"])),
-            opacity_logits=as_tensor(byte_logits((some["packed_color"] & 255).astype(np.uint8))),
+            means=as_tensor(values[:, :3]),
+            log_scales=as_tensor(values[:, 3:6]),
+            quats=as_tensor(with_largest(others, rotation >> 30)),
+            opacity_logits=as_tensor(byte_logits((color & 255).astype(np.uint8))),
             sh=as_tensor(sh),
         )
 
-    return gathered(path, count, REST_SIZES.index(size), header.up or up, local)
+    return gathered(path, count, header.up or up, local)
 
 
 def is_compressed(header: PlyHeader) -> bool:
     """Return whether a PLY file has the packed properties of a compressed PLY."""
     vertex = header.element(VERTEX)
     return vertex is not None and "packed_position" in vertex.names
-
-
-def _require_layout(path: Path, tables: Mapping[str, np.ndarray], rest_names: Sequence[str]) -> None:
-    """Raise ``UserError`` unless the tables have the types and numbers of rows of a compressed PLY."""
-    vertices = tables[VERTEX]
-    kinds = {vertices.dtype[name].str[1:] for name in PACKED}
-    rest_kinds = {tables["sh"].dtype[name].str[1:] for name in rest_names}
-    is_whole = len(tables["chunk"]) == -(-len(vertices) // CHUNK_ROWS)
-    if rest_names:
-        is_whole &= len(tables["sh"]) == len(vertices)
-    if kinds != {"u4"} or not rest_kinds <= {"u1"} or not is_whole:
-        problem = "its elements have other types or numbers of rows than the format"
-        raise unusable(path, f"not a compressed ply: {problem}")
-
-
-def _require_finite(path: Path, gaussians: Gaussians) -> None:
-    if not all(bool(tensor.isfinite().all()) for tensor in gaussians.tensors().values()):
-        raise UserError(f"{path}: expected finite numbers, got NaN or infinity. Try: 'exporter=[ply]'")
 
 
 def morton_order(positions: np.ndarray) -> np.ndarray:
@@ -225,34 +216,3 @@ def _unpacked(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
         columns.append((words & ((1 << size) - 1)) / ((1 << size) - 1))
         words = words >> size
     return np.stack(columns[::-1], axis=1)
-
-
-def _packed_rotations(quats: np.ndarray) -> np.ndarray:
-    """Return unit quaternions wxyz [n 4] as integers."""
-    rows = np.arange(len(quats))
-    largest = np.abs(quats).argmax(axis=1)
-    # Both signs are the same rotation.
-    quats = quats * np.where(quats[rows, largest] < 0, -1, 1)[:, None]
-    others = quats[np.arange(4) != largest[:, None]].reshape(len(quats), 3)
-    shares = others / (2 * LARGEST_OF_SMALLEST) + 0.5
-    return largest.astype(np.uint32) << 30 | _packed(shares, ROTATION_BITS)
-
-
-def _unpacked_rotations(words: np.ndarray) -> np.ndarray:
-    """Return the quaternions wxyz [n 4] of integers."""
-    others = (_unpacked(words, ROTATION_BITS) - 0.5) * (2 * LARGEST_OF_SMALLEST)
-    missing = np.sqrt(np.maximum(1 - (others**2).sum(axis=1), 0))
-    quats = np.empty((len(words), 4))
-    is_largest = np.arange(4) == (words >> 30)[:, None]
-    quats[~is_largest] = others.reshape(-1)
-    quats[is_largest] = missing
-    return quats
-
-
-def _sh_bytes(rest: np.ndarray) -> np.ndarray:
-    return np.clip(np.floor((rest.astype(np.float64) / SH_RANGE + 0.5) * 256), 0, 255).astype(np.uint8)
-
-
-def _sh_values(stored: np.ndarray) -> np.ndarray:
-    shares = np.where(stored == 255, 1.0, np.where(stored == 0, 0.0, (stored + 0.5) / 256))
-    return SH_RANGE * (shares - 0.5)

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from cadam3d.core.gaussians import Gaussians
@@ -58,6 +58,32 @@ def unit_quats(gaussians: Gaussians) -> Float[np.ndarray, "n 4"]:
     quats = gaussians.quats.double().numpy()
     lengths = np.linalg.norm(quats, axis=1, keepdims=True)
     return np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1), [1.0, 0.0, 0.0, 0.0])
+
+
+def smallest_three(
+    quats: Float[np.ndarray, "n 4"],
+) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+    """Return the index of the largest component of unit quaternions, and the other three components.
+
+    The largest component is made positive, because both signs of a quaternion are the same rotation.
+    """
+    largest = np.abs(quats).argmax(axis=1)
+    quats = quats * np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, -1, 1)
+    return largest, quats[np.arange(4) != largest[:, None]].reshape(len(quats), 3)
+
+
+def with_largest(others: Float[np.ndarray, "n 3"], largest: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 4"]:
+    """Return unit quaternions from three components and the index of the fourth, which is positive."""
+    is_largest = np.arange(4) == largest[:, None]
+    quats = np.empty((len(others), 4))
+    quats[~is_largest] = others.reshape(-1)
+    quats[is_largest] = np.sqrt(np.maximum(1 - (others**2).sum(axis=1), 0))
+    return quats
+
+
+def is_finite(gaussians: Gaussians) -> bool:
+    """Return whether no number is NaN or infinite."""
+    return all(bool(tensor.isfinite().all()) for tensor in gaussians.tensors().values())
 
 
 def in_file_axes(gaussians: Gaussians, up: str) -> Gaussians:

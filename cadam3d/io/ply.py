@@ -109,7 +109,7 @@ def read_ply(path: Path, *, up: str = "-y") -> Gaussians:
             sh=as_tensor(np.concatenate([columns(some, SH0)[:, None], higher], axis=1)),
         )
 
-    return gathered(path, len(table), REST_SIZES.index(size), header.up or up, local)
+    return gathered(path, len(table), header.up or up, local)
 
 
 def _finite_logits(logits: np.ndarray) -> np.ndarray:

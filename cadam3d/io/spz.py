@@ -35,7 +35,6 @@ gaussforge 0.6.0 writes and reads (``tests/io/test_spz.py`` compares every numbe
 import gzip
 import struct
 import zlib
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -51,8 +50,10 @@ from cadam3d.io.encoding import (
     byte_logits,
     in_file_axes,
     opacities,
+    smallest_three,
     to_bytes,
     unit_quats,
+    with_largest,
 )
 from cadam3d.io.frames import UPS
 from cadam3d.io.gathering import gathered
@@ -114,89 +115,59 @@ def read_spz(path: Path, *, up: str = "+y") -> Gaussians:
     Raises ``UserError`` if ``path`` is not such a file, or would need more memory.
     """
     require_choice("up", up, UPS)
-    try:
-        with opened(path) as file:
-            header, packed = _unzipped(path, file.read())
-    except zlib.error as error:
-        raise unusable(path, f"a damaged gzip stream ({error})") from error
-    blocks = _blocks(header, packed)
-    return gathered(path, header.count, header.degree, up, lambda rows: _decoded(header, blocks, rows))
-
-
-@dataclass(frozen=True)
-class _Header:
-    """The header of a file."""
-
-    version: int
-    count: int  # of Gaussians
-    degree: int  # of SH
-    fractional_bits: int
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Return the bytes per Gaussian of each block."""
-        return (9, 1, 3, 3, 4 if self.version == 3 else 3, 3 * ((self.degree + 1) ** 2 - 1))
-
-    @property
-    def packed_bytes(self) -> int:
-        """Return the bytes of all blocks."""
-        return self.count * sum(self.sizes)
-
-    @property
-    def unpacked_bytes(self) -> int:
-        """Return the bytes of the Gaussians in memory."""
-        return 4 * self.count * (11 + 3 * (self.degree + 1) ** 2)
-
-
-def _unzipped(path: Path, content: bytes) -> tuple[_Header, bytes]:
-    """Return the header and the bytes of all blocks. Nothing is decompressed beyond what is needed."""
+    with opened(path) as file:
+        content = file.read()
     if content.startswith(MAGIC):
         raise UserError(f"{path}: expected SPZ version 2 or 3, got version 4 or later. Try: {CONVERSION}")
     inflate = zlib.decompressobj(wbits=31)  # gzip, whose checksum is verified
-    start = inflate.decompress(content, HEADER.size)
-    if len(start) < HEADER.size or not start.startswith(MAGIC):
-        raise unusable(path, "not an spz file")
-    _, version, count, degree, fractional_bits, flags, _ = HEADER.unpack(start)
-    if version not in VERSIONS or degree > MAX_DEGREE:
-        wanted = f"SPZ version 2 or 3 and SH degree 0 to {MAX_DEGREE}"
-        raise unusable(path, f"expected {wanted}, got version {version} and degree {degree}")
-    header = _Header(version, count, degree, fractional_bits)
-    if header.packed_bytes + header.unpacked_bytes > MOST_EXPANSION * len(content) + SPARE_BYTES:
-        raise unusable(path, f"its header promises {count:,} Gaussians, too many for {len(content):,} bytes")
-    # A limit of 0 would be none at all. One byte more shows whether the stream goes on.
-    packed = inflate.decompress(inflate.unconsumed_tail, header.packed_bytes + 1)
-    is_at_end = len(packed) == header.packed_bytes and inflate.eof and not inflate.unused_data
-    if len(packed) < header.packed_bytes or not (is_at_end or flags & HAS_EXTENSIONS):
-        raise unusable(path, f"expected {header.packed_bytes:,} bytes after its header, got another number")
-    return header, packed
+    try:
+        start = inflate.decompress(content, HEADER.size)
+        if len(start) < HEADER.size or not start.startswith(MAGIC):
+            raise unusable(path, "not an spz file")
+        _, version, count, degree, fractional_bits, flags, _ = HEADER.unpack(start)
+        if version not in VERSIONS or degree > MAX_DEGREE:
+            wanted = f"SPZ version 2 or 3 and SH degree 0 to {MAX_DEGREE}"
+            raise unusable(path, f"expected {wanted}, got version {version} and degree {degree}")
+        coefficients = (degree + 1) ** 2
+        sizes = [9, 1, 3, 3, 4 if version == 3 else 3, 3 * (coefficients - 1)]
+        length = count * sum(sizes)
+        if length + 4 * count * (11 + 3 * coefficients) > MOST_EXPANSION * len(content) + SPARE_BYTES:
+            promise = f"its header promises {count:,} Gaussians"
+            raise unusable(path, f"{promise}, too many for {len(content):,} bytes")
+        # A limit of 0 would be none at all. One byte more shows whether the stream goes on.
+        packed = inflate.decompress(inflate.unconsumed_tail, length + 1)
+    except zlib.error as error:
+        raise unusable(path, f"a damaged gzip stream ({error})") from error
+    is_at_end = len(packed) == length and inflate.eof and not inflate.unused_data
+    if len(packed) < length or not (is_at_end or flags & HAS_EXTENSIONS):
+        raise unusable(path, f"expected {length:,} bytes after its header, got another number")
+    numbers = np.frombuffer(packed, np.uint8, count=length)
+    ends = count * np.cumsum(sizes)
+    blocks = [
+        each.reshape(count, size) for each, size in zip(np.split(numbers, ends[:-1]), sizes, strict=True)
+    ]
 
+    def local(rows: slice) -> Gaussians:
+        positions, alphas, colors, scales, rotations, rest = (block[rows] for block in blocks)
+        digits = positions.reshape(-1, 3, 3).astype(np.int32)
+        fixed = digits[..., 0] | digits[..., 1] << 8 | digits[..., 2] << 16
+        signed = (fixed ^ 1 << 23) - (1 << 23)
+        xyzw = (
+            _from_smallest_three(rotations)
+            if version == 3
+            else with_largest(rotations / 127.5 - 1, np.full(len(rotations), 3))
+        )
+        dc = (colors.astype(np.float64) / 255 - 0.5) / COLOR_SCALE
+        sh = np.concatenate([dc, rest / 128.0 - 1], axis=1)
+        return Gaussians(
+            means=as_tensor(np.ldexp(signed.astype(np.float64), -fractional_bits)),
+            log_scales=as_tensor(scales / 16.0 - 10),
+            quats=as_tensor(xyzw[:, [3, 0, 1, 2]]),
+            opacity_logits=as_tensor(byte_logits(alphas[:, 0])),
+            sh=as_tensor(sh.reshape(len(sh), coefficients, 3)),
+        )
 
-def _blocks(header: _Header, packed: bytes) -> list[np.ndarray]:
-    """Return the blocks of a file as bytes, one row for each Gaussian."""
-    blocks, start = [], 0
-    for size in header.sizes:
-        block = np.frombuffer(packed, np.uint8, count=header.count * size, offset=start)
-        blocks.append(block.reshape(header.count, size))
-        start += block.size
-    return blocks
-
-
-def _decoded(header: _Header, blocks: list[np.ndarray], rows: slice) -> Gaussians:
-    """Return some rows of the blocks as Gaussians in the axes of the file."""
-    positions, alphas, colors, scales, rotations, rest = (block[rows] for block in blocks)
-    digits = positions.reshape(-1, 3, 3).astype(np.int32)
-    fixed = digits[..., 0] | digits[..., 1] << 8 | digits[..., 2] << 16
-    signed = (fixed ^ 1 << 23) - (1 << 23)
-    unpack = _from_smallest_three if header.version == 3 else _from_first_three
-    dc = (colors.astype(np.float64) / 255 - 0.5) / COLOR_SCALE
-    sh = np.concatenate([dc[:, None], rest.reshape(len(rest), -1, 3) / 128.0 - 1], axis=1)
-    return Gaussians(
-        means=as_tensor(np.ldexp(signed.astype(np.float64), -header.fractional_bits)),
-        log_scales=as_tensor(scales / 16.0 - 10),
-        quats=as_tensor(unpack(rotations)),
-        opacity_logits=as_tensor(byte_logits(alphas[:, 0])),
-        sh=as_tensor(sh),
-    )
+    return gathered(path, count, up, local)
 
 
 def _fractional_bits(path: Path, local: Gaussians) -> int:
@@ -212,42 +183,20 @@ def _fractional_bits(path: Path, local: Gaussians) -> int:
 
 
 def _smallest_three(quats: np.ndarray) -> np.ndarray:
-    """Return the rotations [n 4 bytes] of unit quaternions (w, x, y, z) in version 3."""
-    xyzw = quats[:, [1, 2, 3, 0]]
-    largest = np.abs(xyzw).argmax(axis=1)
-    xyzw = xyzw * np.where(np.take_along_axis(xyzw, largest[:, None], axis=1) < 0, -1, 1)
-    magnitudes = np.minimum(np.rint(np.abs(xyzw) / LARGEST_OF_SMALLEST * 511), 511).astype(np.uint32)
-    fields = magnitudes | (xyzw < 0).astype(np.uint32) << 9
-    words = largest.astype(np.uint32)
-    for component in range(4):
-        words = np.where(component == largest, words, words << 10 | fields[:, component])
-    return words.astype("<u4")[:, None].view(np.uint8)
+    """Return the rotations of unit quaternions (w, x, y, z) in version 3, as integers."""
+    largest, others = smallest_three(quats[:, [1, 2, 3, 0]])
+    magnitudes = np.minimum(np.rint(np.abs(others) / LARGEST_OF_SMALLEST * 511), 511).astype(np.uint32)
+    fields = magnitudes | (others < 0).astype(np.uint32) << 9
+    words = largest.astype(np.uint32) << 30
+    return (words | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]).astype("<u4")
 
 
 def _from_smallest_three(packed: np.ndarray) -> np.ndarray:
-    """Return the quaternions (w, x, y, z) of rotations in version 3; the inverse of _smallest_three."""
-    words = np.ascontiguousarray(packed).view("<u4")[:, 0]
-    largest = words >> 30
-    xyzw = np.zeros((len(words), 4))
-    for component in (3, 2, 1, 0):
-        sign = np.where(words >> 9 & 1, -1.0, 1.0)
-        value = sign * (words & 511) * (LARGEST_OF_SMALLEST / 511)
-        xyzw[:, component] = np.where(component == largest, 0, value)
-        words = np.where(component == largest, words, words >> 10)
-    return _with_remainder(xyzw, largest)[:, [3, 0, 1, 2]]
-
-
-def _from_first_three(packed: np.ndarray) -> np.ndarray:
-    """Return the quaternions (w, x, y, z) of rotations in version 2."""
-    xyzw = np.zeros((len(packed), 4))
-    xyzw[:, :3] = packed / 127.5 - 1
-    return _with_remainder(xyzw, np.full(len(packed), 3))[:, [3, 0, 1, 2]]
-
-
-def _with_remainder(quats: np.ndarray, missing: np.ndarray) -> np.ndarray:
-    """Return unit quaternions whose component ``missing``, which is zero, is computed from the others."""
-    rest = np.sqrt(np.maximum(1 - (quats**2).sum(axis=1), 0))
-    return np.where(np.arange(4) == missing[:, None], rest[:, None], quats)
+    """Return the quaternions (x, y, z, w) of rotations [n 4 bytes] in version 3."""
+    words = np.ascontiguousarray(packed).view("<u4")
+    fields = words >> np.array([20, 10, 0], dtype=np.uint32)
+    signs = np.where(fields >> 9 & 1, -1.0, 1.0)
+    return with_largest(signs * (fields & 511) * (LARGEST_OF_SMALLEST / 511), words[:, 0] >> 30)
 
 
 def _sh_bytes(rest: np.ndarray) -> np.ndarray:
