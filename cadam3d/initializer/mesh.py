@@ -58,8 +58,10 @@ class Mesh(FromObject):
         Raises ``UserError`` if the file is missing, cannot be read or has no surface.
         """
         parts = self._load()
-        corners = torch.cat([_corners(part) for part in parts])
-        corners = self._place(corners.flatten(end_dim=1)).view_as(corners)
+        corners = np.concatenate([np.asarray(part.vertices)[np.asarray(part.faces)] for part in parts])
+        points = torch.as_tensor(corners, dtype=torch.float32).flatten(end_dim=1)
+        upright = turned_points(points_to_world(points, f"+{self.up}"), self.turn_deg)
+        corners = self.placed(upright)[0].view(-1, 3, 3)
         faces, weights = points_on_surface(corners, self.count, generator)
         points = (weights[..., None] * corners[faces]).sum(dim=1)
         return self.gaussians_at(PointCloud(points, self._colors(parts, faces, weights)), device)
@@ -87,11 +89,6 @@ class Mesh(FromObject):
             )
         return parts
 
-    def _place(self, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
-        """Return the world positions of points of the file."""
-        upright = turned_points(points_to_world(points, f"+{self.up}"), self.turn_deg)
-        return self.placement(upright).of(upright)
-
     def _colors(
         self, parts: Sequence[trimesh.Trimesh], faces: Int[Tensor, "n"], weights: Float[Tensor, "n 3"]
     ) -> Float[Tensor, "n 3"]:
@@ -105,10 +102,6 @@ class Mesh(FromObject):
                 rgb[is_here] = torch.as_tensor(colors[:, :3] / 255.0, dtype=torch.float32)
             first += len(part.faces)
         return rgb
-
-
-def _corners(part: trimesh.Trimesh) -> Float[Tensor, "f 3 3"]:
-    return torch.as_tensor(np.asarray(part.vertices)[np.asarray(part.faces)], dtype=torch.float32)
 
 
 def _keep_vertex_light(geometry: Any) -> None:

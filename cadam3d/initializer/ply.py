@@ -51,8 +51,7 @@ class Ply(FromObject):
     def __post_init__(self) -> None:
         super().__post_init__()
         unless_none(require_whole, "initializer.count", self.count, low=1)
-        if self.up is not None:
-            require_choice("initializer.up", self.up, UPS)
+        unless_none(require_choice, "initializer.up", self.up, choices=UPS)
         require_copies(self.replicate, self.replicate_radius, self.replicate_law)
         require_color("initializer.color", self.color)
 
@@ -76,44 +75,31 @@ class Ply(FromObject):
         asset = turned(read_gaussians(path, up=self.up), self.turn_deg)
         _require_finite(path, "means", asset.means)
         asset = asset.index(rows_of(len(asset), self.count, generator))
-        place = self.placement(asset.means)
-        return replace(
-            asset,
-            means=place.of(asset.means),
-            log_scales=asset.log_scales + math.log(place.factor),
-            sh=asset.sh if self.sh_degree is None else _with_degree(asset.sh, self.sh_degree),
-        )
+        means, factor = self.placed(asset.means)
+        sh = asset.sh
+        if self.sh_degree is not None:
+            wanted = (self.sh_degree + 1) ** 2
+            sh = torch.nn.functional.pad(sh[:, :wanted], (0, 0, 0, max(wanted - sh.shape[1], 0)))
+        return replace(asset, means=means, log_scales=asset.log_scales + math.log(factor), sh=sh)
 
     def _cloud(self, path: Path, generator: torch.Generator, device: torch.device) -> Gaussians:
-        points, rgb = self._read_points(path)
-        points = turned_points(points_to_world(points, self.up or UP_OF_POINTS), self.turn_deg)
-        rows = rows_of(len(points), self.count, generator)
-        points = points[rows]
-        place = self.placement(points)
-        cloud = PointCloud(place.of(points), rgb[rows])
-        cloud = replicated(cloud, self.replicate, self.replicate_radius, generator, self.replicate_law)
-        return self.gaussians_at(cloud, device)
-
-    def _read_points(self, path: Path) -> tuple[Tensor, Tensor]:
-        """Return positions in the axes of the file, and RGB in [0, 1]."""
         header = read_header(path)
         if any(element.name in SURFACES and element.count for element in header.elements):
             raise UserError(
                 f"initializer.path: expected a file of Gaussians or points, got {self.path!r}, which is a "
                 "mesh. Try: initializer=mesh"
             )
-        positions, rgb = read_points(header)
+        positions, colors = read_points(header)
         points = torch.from_numpy(positions)
         _require_finite(path, "points", points)
-        return points, one_color(self.color, len(points)) if rgb is None else torch.from_numpy(rgb)
+        rgb = one_color(self.color, len(points)) if colors is None else torch.from_numpy(colors)
+        upright = turned_points(points_to_world(points, self.up or UP_OF_POINTS), self.turn_deg)
+        rows = rows_of(len(points), self.count, generator)
+        cloud = PointCloud(self.placed(upright[rows])[0], rgb[rows])
+        cloud = replicated(cloud, self.replicate, self.replicate_radius, generator, self.replicate_law)
+        return self.gaussians_at(cloud, device)
 
 
 def _require_finite(path: Path, name: str, rows: Tensor) -> None:
     is_usable = len(rows) > 0 and bool(rows.isfinite().all())
     require(is_usable, "initializer.path", expected=f"finite {name} in the file", got=str(path))
-
-
-def _with_degree(sh: Tensor, degree: int) -> Tensor:
-    """Return the coefficients up to ``degree``, with zeros where the file has none."""
-    wanted = (degree + 1) ** 2
-    return torch.nn.functional.pad(sh[:, :wanted], (0, 0, 0, max(wanted - sh.shape[1], 0)))

@@ -1,7 +1,6 @@
 """From coloured points to Gaussians: what the initializers share that start from points or from an object."""
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +10,12 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from cadam3d.core.checks import fail, require, require_choice, require_range, require_whole, unless_none
+from cadam3d.core.checks import require, require_choice, require_range, require_whole, unless_none
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE, rgb_to_sh0
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.frames import TURNS
+from cadam3d.io.run_folder import expanded, has_file
 
 # As in 3DGS (Kerbl et al. 2023, sec. 5.1).
 NEIGHBOURS = 3
@@ -37,26 +37,6 @@ class PointCloud:
     def __len__(self) -> int:
         return self.points.shape[0]
 
-    def to(self, device: torch.device) -> "PointCloud":
-        """Return the same cloud on ``device``."""
-        return PointCloud(self.points.to(device), self.rgb.to(device))
-
-
-@dataclass(frozen=True)
-class Placement:
-    """Moves points without turning them: the centre to the origin, then larger or smaller, then up."""
-
-    center: Float[Tensor, "3"]
-    factor: float
-    lift: float  # world units
-
-    def of(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Return the moved points, in world units."""
-        moved = (points - self.center) * self.factor
-        if self.lift:
-            moved[:, 2] += self.lift
-        return moved
-
 
 @dataclass(frozen=True, kw_only=True)
 class FromPoints(Initializer):
@@ -74,10 +54,22 @@ class FromPoints(Initializer):
         require_whole("initializer.sh_degree", self.sh_degree or 0, low=0, high=MAX_DEGREE)
 
     def gaussians_at(self, cloud: PointCloud, device: torch.device) -> Gaussians:
-        """Return Gaussians on ``device`` at the points of a cloud."""
-        degree = self.sh_degree or 0
-        return gaussians_at(
-            cloud.to(device), scale=self.scale, opacity=self.opacity, sh_degree=degree, law=self.scale_law
+        """Return round Gaussians on ``device`` that have the same colour from every side.
+
+        They are at the points of a cloud in world units. If ``scale`` is None, each has the distance to its
+        three nearest neighbours, so that neighbours just overlap.
+        """
+        points, n = cloud.points.to(device), len(cloud)
+        law = self.scale_law
+        scales = neighbour_distance(points, law) if self.scale is None else points.new_full((n,), self.scale)
+        sh = points.new_zeros(n, ((self.sh_degree or 0) + 1) ** 2, 3)
+        sh[:, 0] = rgb_to_sh0(cloud.rgb.to(device))
+        return Gaussians(
+            means=points,
+            log_scales=scales.log()[:, None].repeat(1, 3),
+            quats=points.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+            opacity_logits=points.new_full((n,), math.log(self.opacity / (1 - self.opacity))),
+            sh=sh,
         )
 
 
@@ -105,36 +97,18 @@ class FromObject(FromPoints):
             )
         require_range("initializer.lift", self.lift, low=-1, high=1)
 
-    def placement(self, points: Float[Tensor, "n 3"]) -> Placement:
-        """Return how to move the points of the object into the world.
+    def placed(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], float]:
+        """Return points of the object, which is upright, in the world, and the factor of their distances.
 
         They are fitted to ``radius`` (:func:`fit`). With a ``factor`` they are multiplied by it instead, and
         not centred. Then they are lifted.
         """
-        if self.factor is not None:
-            return Placement(torch.zeros_like(points[0]), self.factor, self.lift)
-        return Placement(*fit(points, self.radius), self.lift)
-
-
-def gaussians_at(
-    cloud: PointCloud, *, scale: float | None, opacity: float, sh_degree: int, law: str = "mean"
-) -> Gaussians:
-    """Return round Gaussians at the points (world units) that have the same colour from every side.
-
-    ``scale`` is their standard deviation in world units. None gives each Gaussian the distance to its three
-    nearest neighbours, combined by ``law`` (one of ``SCALE_LAWS``), so that neighbours just overlap.
-    """
-    points, n = cloud.points, len(cloud)
-    scales = neighbour_distance(points, law) if scale is None else points.new_full((n,), scale)
-    sh = points.new_zeros(n, (sh_degree + 1) ** 2, 3)
-    sh[:, 0] = rgb_to_sh0(cloud.rgb)
-    return Gaussians(
-        means=points,
-        log_scales=scales.log()[:, None].repeat(1, 3),
-        quats=points.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-        opacity_logits=points.new_full((n,), math.log(opacity / (1 - opacity))),
-        sh=sh,
-    )
+        center, factor = fit(points, self.radius)
+        factor = factor if self.factor is None else self.factor
+        moved = (points - center) * factor
+        if self.lift:
+            moved[:, 2] += self.lift
+        return moved, factor
 
 
 def neighbour_distance(points: Float[Tensor, "n 3"], law: str = "mean") -> Float[Tensor, "n"]:
@@ -247,18 +221,16 @@ def fit(points: Float[Tensor, "n 3"], radius: float | None) -> tuple[Float[Tenso
         return torch.zeros_like(points[0]), 1.0
     center = (points.amin(dim=0) + points.amax(dim=0)) / 2
     farthest = float((points - center).norm(dim=-1).max())
-    if not math.isfinite(farthest):
-        got, example = float(points.abs().max()), "initializer.radius=null"
-        raise fail("initializer.path", expected="points at distances below 1e19", got=got, example=example)
+    expected, got = "points at distances below 1e19", float(points.abs().max())
+    require(math.isfinite(farthest), "initializer.path", expected=expected, got=got)
     return center, radius / farthest if farthest > 0 else 1.0
 
 
 def found_file(path: str) -> Path:
     """Return the path that ``initializer.path`` names. Raises ``UserError`` unless it is a file."""
-    found = Path(path).expanduser()
-    # Unlike Path.is_file, this is False for names that the system refuses, such as one that is too long.
-    is_file = os.path.isfile(found)  # noqa: PTH113
-    require(is_file, "initializer.path", expected="a file", got=path, example="initializer.path=FILE")
+    found = expanded(path)
+    example = "initializer.path=FILE"
+    require(has_file(found), "initializer.path", expected="a file", got=path, example=example)
     return found
 
 

@@ -74,7 +74,6 @@ class ShapE(FromObject):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._source()
         require_choice("initializer.dtype", self.dtype, ("auto", *DTYPES))
         require_whole("initializer.steps", self.steps, low=1, high=1024)
         require_range("initializer.guidance_scale", self.guidance_scale, low=1)
@@ -109,7 +108,8 @@ class ShapE(FromObject):
 
         Raises ``UserError`` if the model is not available, does not fit into memory or finds no surface.
         """
-        found = self._source().find((KIND,), OTHERS)
+        source = ModelSource("initializer", self.path, self.ids, self.revision, self.variant)
+        found = source.find((KIND,), OTHERS)
         try:
             latent = self.sample(found, prompt, generator, device)
             mesh = self.decode(found, latent)
@@ -119,7 +119,9 @@ class ShapE(FromObject):
                 f"Try: initializer.dtype=float16 initializer.grid_size={max(self.grid_size // 2, 2)}"
             ) from error
         finally:
-            _free()
+            gc.collect()
+            if torch.cuda.is_available():
+                torch.cuda.empty_cache()
         return self.settle(mesh, generator, device)
 
     def sample(
@@ -167,25 +169,19 @@ class ShapE(FromObject):
 
     def settle(self, mesh: ColoredMesh, generator: torch.Generator, device: torch.device) -> Gaussians:
         """Return Gaussians on ``device`` at points of a mesh that Shap-E decoded."""
-        cloud = self._points(mesh, generator)
+        cloud = PointCloud(mesh.vertices, mesh.rgb)
+        if self.count is not None:
+            corners, colors = mesh.vertices[mesh.faces], mesh.rgb[mesh.faces]
+            faces, weights = points_on_surface(corners, self.count, generator)
+            weights = weights[..., None]
+            cloud = PointCloud((weights * corners[faces]).sum(dim=1), (weights * colors[faces]).sum(dim=1))
         if self.grow_points > 0:
             cloud = grown(cloud, self.grow_points, self.grow_distance, self.grow_noise, generator)
         upright = turned_points(cloud.points, self.turn_deg)
         rgb = cloud.rgb if self.color is None else one_color(self.color, len(cloud))
-        cloud = PointCloud(self.placement(upright).of(upright), rgb)
+        cloud = PointCloud(self.placed(upright)[0], rgb)
         cloud = replicated(cloud, self.replicate, self.replicate_radius, generator, self.replicate_law)
         return self.gaussians_at(cloud, device)
-
-    def _points(self, mesh: ColoredMesh, generator: torch.Generator) -> PointCloud:
-        if self.count is None:
-            return PointCloud(mesh.vertices, mesh.rgb)
-        corners, colors = mesh.vertices[mesh.faces], mesh.rgb[mesh.faces]
-        faces, weights = points_on_surface(corners, self.count, generator)
-        weights = weights[..., None]
-        return PointCloud((weights * corners[faces]).sum(dim=1), (weights * colors[faces]).sum(dim=1))
-
-    def _source(self) -> ModelSource:
-        return ModelSource("initializer", self.path, self.ids, self.revision, self.variant)
 
 
 def _refuse_empty_mesh(_decoder: object, _inputs: object, mesh: Any) -> None:
@@ -198,9 +194,3 @@ def _refuse_empty_mesh(_decoder: object, _inputs: object, mesh: Any) -> None:
             "initializer: Shap-E found no surface for this prompt. Another seed or a simpler description "
             "may help. Try: 'initializer.prompt=a chair'"
         )
-
-
-def _free() -> None:
-    gc.collect()
-    if torch.cuda.is_available():
-        torch.cuda.empty_cache()

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Integer, UInt8
 from torch import Tensor
 
 from cadam3d.core.gaussians import Gaussians
@@ -62,7 +62,7 @@ def unit_quats(gaussians: Gaussians) -> Float[np.ndarray, "n 4"]:
 
 def smallest_three(
     quats: Float[np.ndarray, "n 4"],
-) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+) -> tuple[Integer[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
     """Return the index of the largest component of unit quaternions, and the other three components.
 
     The largest component is made positive, because both signs of a quaternion are the same rotation.
@@ -72,7 +72,9 @@ def smallest_three(
     return largest, quats[np.arange(4) != largest[:, None]].reshape(len(quats), 3)
 
 
-def with_largest(others: Float[np.ndarray, "n 3"], largest: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 4"]:
+def with_largest(
+    others: Float[np.ndarray, "n 3"], largest: Integer[np.ndarray, "n"]
+) -> Float[np.ndarray, "n 4"]:
     """Return unit quaternions from three components and the index of the fourth, which is positive."""
     is_largest = np.arange(4) == largest[:, None]
     quats = np.empty((len(others), 4))

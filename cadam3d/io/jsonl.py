@@ -4,17 +4,22 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Annotated, Any, TypeGuard
+
+from annotated_types import Ge, Le  # comes with pydantic
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
-from cadam3d.io.reading import DEEPEST, LARGEST_TEXT, read_bytes
+from cadam3d.io.reading import LARGEST_TEXT, read_bytes
 
 # Limits of numbers in the files of a run. Nothing real comes near them.
 MOST = 10**12  # steps, Gaussians, bytes
 LARGEST_NUMBER = 1e100  # that charts can draw
-LARGEST_FLOAT = 1e308
+# The same limits, for :func:`fits`.
+Whole = Annotated[int, Ge(0), Le(MOST)]
+Real = Annotated[float, Ge(-LARGEST_NUMBER), Le(LARGEST_NUMBER)]
 
 
 def append_jsonl(path: Path, line: Mapping[str, Any]) -> None:
@@ -26,10 +31,10 @@ def append_jsonl(path: Path, line: Mapping[str, Any]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a+b") as file:
-            is_cut = file.tell() > 0 and _last_byte(file) != b"\n"
+            file.seek(max(file.tell() - 1, 0))
+            is_cut = file.read() not in (b"", b"\n")
             # With a single write call, a kill can only cut off the end, which the reader detects.
             file.write(b"\n" * is_cut + to_json(line).encode() + b"\n")
-            file.flush()
     except OSError as error:
         reason = error.strerror or str(error)
         raise UserError(f"{path}: cannot be written ({reason}). Try: hydra.run.dir=DIR") from error
@@ -77,8 +82,7 @@ def write_json(path: Path, value: Mapping[str, Any] | Sequence[Any]) -> None:
 def read_json(path: Path) -> Any:
     """Return the value in a JSON file.
 
-    Raises ``UserError`` if it is missing, or not plain JSON: UTF-8, without NaN, infinities, numbers beyond
-    those of floating point, and more levels than any file of a run has.
+    Raises ``UserError`` if it is missing, or not plain JSON: UTF-8, without NaN and infinities.
     """
     content = read_bytes(path, largest=LARGEST_TEXT)
     try:
@@ -100,6 +104,22 @@ def is_number(value: object) -> TypeGuard[float]:
     return type(value) in (int, float) and abs(value) <= LARGEST_NUMBER  # pyright: ignore[reportArgumentType]
 
 
+def fits(value: object, kind: Any) -> bool:
+    """Return whether ``value`` is of a ``kind``, an annotation that pydantic checks without conversions."""
+    try:
+        _adapter(kind).validate_python(value, strict=True)
+    except ValueError:
+        return False
+    return True
+
+
+@cache
+def _adapter(kind: Any) -> Any:
+    from pydantic import TypeAdapter  # takes a tenth of a second to load
+
+    return TypeAdapter(kind)
+
+
 def to_json(value: Any, indent: int | None = None) -> str:
     """Return standard JSON, without the NaN and Infinity that Python would write."""
     return json.dumps(_standard(value), indent=indent, ensure_ascii=False, allow_nan=False)
@@ -108,26 +128,9 @@ def to_json(value: Any, indent: int | None = None) -> str:
 def parse_json(content: bytes) -> Any:
     """Return the value of a JSON text. Raises ``ValueError`` or ``RecursionError`` for any other text."""
     value = json.loads(content.decode("utf-8"))
-    _require_plain(value, DEEPEST)
+    # This raises the same errors for NaN, infinities and half of a character pair, which JSON can spell.
+    json.dumps(value, ensure_ascii=False, allow_nan=False).encode("utf-8")
     return value
-
-
-def _require_plain(value: Any, levels: int) -> None:
-    """Raise ``ValueError`` for what JSON can spell but nothing here can write or calculate with."""
-    if levels < 0:
-        raise ValueError(f"more than {DEEPEST} levels")
-    if isinstance(value, dict):
-        for key, item in value.items():
-            _require_plain(key, levels - 1)
-            _require_plain(item, levels - 1)
-    elif isinstance(value, list):
-        for item in value:
-            _require_plain(item, levels - 1)
-    elif isinstance(value, str):
-        # An escaped half of a character pair cannot be written again.
-        value.encode("utf-8")
-    elif isinstance(value, int | float) and not abs(value) < LARGEST_FLOAT:
-        raise ValueError("a number that floating point cannot hold")
 
 
 def _standard(value: Any) -> Any:
@@ -138,8 +141,3 @@ def _standard(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_standard(item) for item in value]
     return str(value) if isinstance(value, Path) else value
-
-
-def _last_byte(file) -> bytes:
-    file.seek(-1, 2)
-    return file.read(1)

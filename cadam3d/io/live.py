@@ -16,7 +16,7 @@ from typing import Any
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import TEMPORARY
-from cadam3d.io.jsonl import is_number, is_whole, parse_json, to_json
+from cadam3d.io.jsonl import Real, Whole, fits, parse_json, to_json
 from cadam3d.io.lock import process_name
 from cadam3d.io.reading import read_bytes, regular_descriptor
 from cadam3d.io.run_folder import (
@@ -34,17 +34,14 @@ FILES = (*REQUESTS.values(), LIVE_SNAPSHOT, LIVE_STATE, LIVE_WATCHED)
 LARGEST_STATE = 1 << 16  # bytes
 # An open page touches a file about once a second. After this time without a touch, it counts as closed.
 WATCHED_SECONDS = 5.0
-# The entries of state.json.
-ENTRIES = {
-    "process": lambda value: isinstance(value, str),
-    "step": is_whole,
-    "total_steps": is_whole,
-    "num_gaussians": is_whole,
-    "seconds": is_number,
-    "loss": lambda value: value is None or is_number(value),
-    "is_paused": lambda value: isinstance(value, bool),
-    "has_ended": lambda value: isinstance(value, bool),
-    "statistics": lambda value: isinstance(value, dict) and all(map(is_number, value.values())),
+# The kinds of the entries of state.json.
+KINDS = {
+    "process": str,
+    **dict.fromkeys(("step", "total_steps", "num_gaussians"), Whole),
+    "seconds": Real,
+    "loss": Real | None,
+    **dict.fromkeys(("is_paused", "has_ended"), bool),
+    "statistics": dict[str, Real],
 }
 
 
@@ -170,9 +167,10 @@ def read_state(run: Path) -> dict[str, Any] | None:
         state = parse_json(read_bytes(path, largest=LARGEST_STATE))
     except (UserError, ValueError, RecursionError):
         return None
-    if not isinstance(state, dict) or not all(name in state for name in ENTRIES):
-        return None
-    return state if all(is_sound(state[name]) for name, is_sound in ENTRIES.items()) else None
+    is_sound = isinstance(state, dict) and all(
+        name in state and fits(state[name], kind) for name, kind in KINDS.items()
+    )
+    return state if is_sound else None
 
 
 def _touch(path: Path) -> bool:

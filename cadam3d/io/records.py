@@ -4,16 +4,18 @@ Numbers and text in these files may come from a stranger, and reports calculate 
 only entries of the kinds that training writes.
 """
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from annotated_types import Ge, Le  # comes with pydantic
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.number import COUNT, Number
 from cadam3d.core.outcome import Outcome
-from cadam3d.io.jsonl import is_number, is_whole, read_json, read_jsonl
+from cadam3d.io.jsonl import Real, Whole, fits, is_number, read_json, read_jsonl
 from cadam3d.io.reading import read_yaml
 from cadam3d.io.run_folder import EVALUATION, HISTOGRAMS, METRICS, SUMMARY
 
@@ -36,15 +38,19 @@ WEIGHTS = "weights_sha256"
 
 def read_summary(run: Path) -> dict[str, Any]:
     """Return the facts of the run in ``run``; {} if it has no summary, or one that cannot be believed."""
+    summary = _read_entries(run / SUMMARY)
+    kinds = dict.fromkeys(declared(summary), Real | None) | SUMMARY_KINDS
+    is_believed = all(fits(summary[name], kind) for name, kind in kinds.items() if name in summary)
+    return summary if is_believed and summary.get("outcome", Outcome.FINISHED) in set(Outcome) else {}
+
+
+def _read_entries(path: Path) -> dict[str, Any]:
+    """Return the entries of a JSON file; {} if it cannot be read."""
     try:
-        summary = read_json(run / SUMMARY)
+        entries = read_json(path)
     except UserError:
         return {}
-    if not isinstance(summary, dict):
-        return {}
-    entries = dict.fromkeys(declared(summary), _is_number_or_none) | SUMMARY_ENTRIES
-    is_believed = all(is_entry(summary[name]) for name, is_entry in entries.items() if name in summary)
-    return summary if is_believed else {}
+    return entries if isinstance(entries, dict) else {}
 
 
 def declared(facts: Mapping[str, Any]) -> dict[str, Number]:
@@ -74,15 +80,11 @@ def psnr_of(summary: Mapping[str, Any]) -> float | None:
 
 def read_evaluation(run: Path, summary: Mapping[str, Any]) -> dict[str, Any]:
     """Return ``eval.json``; {} if it cannot be read, or if it describes another asset than ``summary``."""
-    try:
-        evaluation = read_json(run / EVALUATION)
-    except UserError:
-        return {}
-    if not isinstance(evaluation, dict) or evaluation.get("num_gaussians") != summary.get("num_gaussians"):
-        return {}
+    evaluation = _read_entries(run / EVALUATION)
+    is_of_asset = evaluation.get("num_gaussians") == summary.get("num_gaussians")
     # A run that was resumed may have as many Gaussians as before, but it has more steps.
     is_of_run = evaluation.get("steps", summary.get("steps")) == summary.get("steps")
-    return evaluation if is_of_run else {}
+    return evaluation if is_of_asset and is_of_run else {}
 
 
 def with_earlier(fresh: Mapping[str, Any], run: Path, metrics: Collection[str]) -> dict[str, Any]:
@@ -195,7 +197,7 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
     Every line has its ``kind`` and its ``step``. All other entries are numbers or None, except for
     ``statistics``, which is a dict of such entries. Raises ``UserError`` if the file cannot be read.
     """
-    return [line for line in read_jsonl(run / METRICS) if is_metrics(line)]
+    return [line for line in read_jsonl(run / METRICS) if _is_metrics(line)]
 
 
 def read_histograms(run: Path) -> list[dict[str, Any]]:
@@ -221,62 +223,36 @@ def _has_text_keys(value: Any) -> bool:
     return not isinstance(value, list) or all(map(_has_text_keys, value))
 
 
-def is_metrics(line: dict[str, Any]) -> bool:
+def _is_metrics(line: dict[str, Any]) -> bool:
     """Return whether a line of ``metrics.jsonl`` has only entries of the kinds that training writes."""
     rest = {key: value for key, value in line.items() if key not in ("kind", "step", "statistics")}
-    statistics = line.get("statistics", {})
-    return (
-        isinstance(line.get("kind"), str)
-        and is_whole(line.get("step"))
-        and isinstance(statistics, dict)
-        and all(map(_is_number_or_none, [*rest.values(), *statistics.values()]))
-    )
+    found = (line.get("kind"), line.get("step"), line.get("statistics", {}), rest)
+    return fits(found, tuple[str, Whole, dict[str, Real | None], dict[str, Real | None]])
 
 
 def _is_histogram(line: dict[str, Any]) -> bool:
-    per_decade, first = line.get("bins_per_decade"), line.get("first")
-    counts: Any = line.get("counts")
-    selected: Any = line.get("selected")
-    if not is_whole(line.get("step")) or not _is_text(line.get("score")):
+    names = ("step", "score", "bins_per_decade", "first", "counts", "selected")
+    bins = Annotated[int, Ge(1), Le(MOST_BINS)]
+    found = tuple(line.get(name) for name in names)
+    if not fits(found, tuple[Whole, str, bins, int, list[Whole], list[Whole]]):
         return False
-    if not is_whole(per_decade) or not 0 < per_decade <= MOST_BINS or type(first) is not int:
-        return False
-    if not _are(is_whole, counts) or not _are(is_whole, selected) or len(counts) != len(selected):
-        return False
-    return -DECADES * per_decade <= first <= first + len(counts) <= DECADES * per_decade
-
-
-def _is_text(value: object) -> bool:
-    return isinstance(value, str)
-
-
-def _is_text_or_none(value: object) -> bool:
-    return value is None or isinstance(value, str)
-
-
-def _is_number_or_none(value: object) -> bool:
-    return value is None or is_number(value)
-
-
-def _are(is_item: Callable[[Any], bool], value: Any) -> bool:
-    """Return whether ``value`` is a list of items of one kind."""
-    return isinstance(value, list) and all(map(is_item, value))
+    _, _, per_decade, first, counts, selected = found
+    is_in_range = -DECADES * per_decade <= first <= first + len(counts) <= DECADES * per_decade
+    return is_in_range and len(counts) == len(selected)
 
 
 # The kinds of the entries of summary.json that other parts calculate with. A summary may have more entries,
 # such as numbers of a metric from elsewhere.
-SUMMARY_ENTRIES: dict[str, Callable[[Any], bool]] = {
-    "outcome": lambda value: _is_text(value) and value in set(Outcome),
-    "warnings": lambda value: _are(_is_text, value),
-    "seconds": lambda value: is_number(value) and value >= 0,
-    "seed": lambda value: type(value) is int and value >= 0,
-    "grows": lambda value: isinstance(value, bool),
-    **dict.fromkeys(("prompt", "message", "device", "backend"), _is_text),
-    **dict.fromkeys(("negative_prompt", "densifier", "guidance", "prior", "initializer"), _is_text_or_none),
-    **dict.fromkeys(("rasterizer", "camera", "refine", "optimizer", "initializer_note"), _is_text_or_none),
-    **dict.fromkeys(("steps", "steps_asked", "num_gaussians", "num_gaussians_initial"), is_whole),
-    **dict.fromkeys(("skipped_steps", "dimmed_steps", "asset_bytes"), is_whole),
-    **dict.fromkeys(("psnr", "ssim", "psnr_turned", "ssim_turned"), _is_number_or_none),
-    "truth": _is_text_or_none,
-    **dict.fromkeys(("memory_estimate_gib", "memory_peak_gib"), _is_number_or_none),
+SUMMARY_KINDS: dict[str, Any] = {
+    "warnings": list[str],
+    "seconds": Annotated[Real, Ge(0)],
+    "seed": Annotated[int, Ge(0)],
+    "grows": bool,
+    **dict.fromkeys(("outcome", "prompt", "message", "device", "backend"), str),
+    **dict.fromkeys(("negative_prompt", "densifier", "guidance", "prior", "initializer"), str | None),
+    **dict.fromkeys(("rasterizer", "camera", "refine", "optimizer", "initializer_note", "truth"), str | None),
+    **dict.fromkeys(("steps", "steps_asked", "num_gaussians", "num_gaussians_initial"), Whole),
+    **dict.fromkeys(("skipped_steps", "dimmed_steps", "asset_bytes"), Whole),
+    **dict.fromkeys(("psnr", "ssim", "psnr_turned", "ssim_turned"), Real | None),
+    **dict.fromkeys(("memory_estimate_gib", "memory_peak_gib"), Real | None),
 }

@@ -265,5 +265,5 @@ def test_an_asset_too_large_to_be_measured_is_refused_only_if_it_is_scaled(tmp_p
     huge.means[1] = far
     write_ply(tmp_path / "a.ply", huge, up="-y", pad_sh=0)
     assert len(build(tmp_path / "a.ply")) == 3
-    with pytest.raises(UserError, match=r"distances below 1e19.*Try: initializer.radius=null$"):
+    with pytest.raises(UserError, match=r"distances below 1e19"):
         build(tmp_path / "a.ply", radius=0.5)

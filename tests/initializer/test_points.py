@@ -5,11 +5,11 @@ import torch
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.sh import evaluate_sh
+from cadam3d.initializer.ball import Ball
 from cadam3d.initializer.points import (
     PointCloud,
     fit,
     found_file,
-    gaussians_at,
     neighbour_distance,
     points_on_surface,
     replicated,
@@ -29,6 +29,20 @@ def colored(n: int, seed: int = 0) -> PointCloud:
     return PointCloud(cloud(n, seed), torch.rand(n, 3, generator=seeded(seed)))
 
 
+def gaussians_at(points: PointCloud, *, sh_degree: int = 0, scale_law: str = "mean"):
+    ball = Ball(
+        count=1,
+        radius=1,
+        color=[0, 0, 0],
+        color_noise=0,
+        scale=None,
+        scale_law=scale_law,
+        opacity=0.1,
+        sh_degree=sh_degree,
+    )
+    return ball.gaussians_at(points, torch.device("cpu"))
+
+
 def by_hand(points: torch.Tensor) -> torch.Tensor:
     distances = (points[:, None] - points[None]).norm(dim=-1)
     return distances.sort(dim=1).values[:, 1:4].mean(dim=1)
@@ -38,7 +52,7 @@ def test_the_law_of_3dgs_is_the_root_of_the_mean_squared_distance():
     points = cloud(100)
     distances = (points[:, None] - points[None]).norm(dim=-1).sort(dim=1).values[:, 1:4]
     torch.testing.assert_close(neighbour_distance(points, "rms"), distances.square().mean(dim=1).sqrt())
-    made = gaussians_at(PointCloud(points, points), scale=None, opacity=0.1, sh_degree=0, law="rms")
+    made = gaussians_at(PointCloud(points, points), scale_law="rms")
     torch.testing.assert_close(made.scales[:, 0], neighbour_distance(points, "rms"))
 
 
@@ -64,7 +78,7 @@ def test_a_single_point_and_an_empty_cloud_are_accepted():
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_gaussians_show_their_color_from_every_side(degree):
-    made = gaussians_at(colored(9), scale=None, opacity=0.1, sh_degree=degree)
+    made = gaussians_at(colored(9), sh_degree=degree)
     assert made.sh_degree == degree
     directions = torch.nn.functional.normalize(cloud(9, seed=1), dim=-1)
     torch.testing.assert_close(evaluate_sh(made.sh, directions), colored(9).rgb)
@@ -72,7 +86,7 @@ def test_gaussians_show_their_color_from_every_side(degree):
 
 def test_gaussians_are_round_and_have_the_given_opacity():
     points = cloud(9)
-    made = gaussians_at(colored(9), scale=None, opacity=0.1, sh_degree=0)
+    made = gaussians_at(colored(9))
     assert torch.equal(made.means, points)
     torch.testing.assert_close(made.opacities, torch.full((9,), 0.1))
     torch.testing.assert_close(made.scales, neighbour_distance(points)[:, None].expand(9, 3))

@@ -9,6 +9,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.sh import SH_C0
 from cadam3d.initializer.ball import Ball
 from cadam3d.initializer.shap_e import KIND, OTHERS, ColoredMesh, ShapE
+from cadam3d.io.pretrained import ModelSource, Pretrained
 
 CPU = torch.device("cpu")
 BALL = Ball(
@@ -65,6 +66,11 @@ def rgb_of(gaussians) -> torch.Tensor:
 
 
 # --- from a mesh to Gaussians
+
+
+def found_by(made: ShapE) -> Pretrained:
+    source = ModelSource("initializer", made.path, made.ids, made.revision, made.variant)
+    return source.find((KIND,), OTHERS)
 
 
 def a_mesh() -> ColoredMesh:
@@ -170,7 +176,7 @@ def models(tmp_path_factory):
 
 def latent(path, seed: int = 0, run_prompt: str = "a corgi", **changes) -> torch.Tensor:
     made = shap_e(path, **changes)
-    return made.sample(made._source().find((KIND,), OTHERS), run_prompt, seeded(seed), CPU)
+    return made.sample(found_by(made), run_prompt, seeded(seed), CPU)
 
 
 def test_the_latent_is_that_of_the_pipeline_itself(models):
@@ -203,7 +209,7 @@ def test_half_precision_is_nearly_the_same_and_returns_float32(models, dtype):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_cuda_in_half_precision_agrees_with_the_cpu(models):
     asked, cuda = shap_e(models[True]), torch.device("cuda")
-    found = asked._source().find((KIND,), OTHERS)
+    found = found_by(asked)
     there = asked.sample(found, "a corgi", seeded(), cuda)
     assert there.device.type == "cuda"
     torch.testing.assert_close(there.cpu(), latent(models[True]), atol=0.05, rtol=0)
@@ -227,7 +233,7 @@ def test_the_prompt_becomes_gaussians(models):
 def test_colors_are_those_that_the_model_paints_with(models):
     """The decoder converts its colours to linear light; the initializer must convert them back."""
     asked = shap_e(models[True])
-    found = asked._source().find((KIND,), OTHERS)
+    found = found_by(asked)
     described = asked.sample(found, "a corgi", seeded(), CPU)
     mesh = asked.decode(found, described)
     renderer = found.part("shap_e_renderer", torch.float32)

@@ -179,7 +179,7 @@ def test_a_truncated_file_is_refused(tmp_path, lost):
 def test_bounds_that_are_not_finite_are_refused(tmp_path):
     bounds = [float("nan"), *[0] * 17]
     (tmp_path / "a.ply").write_bytes(hand_made(NEW, bounds, (0, 0, 0, 0), (0, 0, 0, 0)))
-    with pytest.raises(UserError, match="NaN or infinity in 2 of 2 Gaussians"):
+    with pytest.raises(UserError, match="NaN or infinity"):
         read_compressed_ply(tmp_path / "a.ply")
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import append_jsonl, read_json, read_jsonl, truncate_after, write_json
-from cadam3d.io.records import SUMMARY_ENTRIES, read_config, read_histograms, read_metrics, read_summary
+from cadam3d.io.records import read_config, read_histograms, read_metrics, read_summary
 
 SUMMARY = {
     "prompt": "a red cube",
@@ -53,10 +53,9 @@ def test_honest_files_are_read_as_they_were_written(tmp_path):
 
 
 def test_no_entry_of_a_summary_has_another_kind(tmp_path):
-    for name, is_entry in SUMMARY_ENTRIES.items():
-        for wrong in WRONG:
-            write_json(tmp_path / "summary.json", SUMMARY | {name: wrong})
-            assert read_summary(tmp_path) == (SUMMARY | {name: wrong} if is_entry(wrong) else {})
+    for name in SUMMARY.keys() - {"of_another_metric", "warnings", "prompt", "negative_prompt"}:
+        write_json(tmp_path / "summary.json", SUMMARY | {name: {"a": "b"}})
+        assert read_summary(tmp_path) == {}, name
     for name, wrong in (("psnr", "high"), ("num_gaussians", -1), ("num_gaussians", True), ("outcome", "won")):
         write_json(tmp_path / "summary.json", SUMMARY | {name: wrong})
         assert read_summary(tmp_path) == {}, name
