@@ -1,13 +1,11 @@
 """Draw docs/images/growth.webp: the baseline beside CAdam while they grow from the same seed, then one turn.
 
-    python scripts/make_growth.py                  # trains both densifiers and draws
-    python scripts/make_growth.py --work growth    # keeps the pictures there, and only draws if they exist
+    python scripts/make_growth.py
 
 Both runs have the same prompt, seed, views and noise; only densifier= differs. Training takes two minutes on
 two cores, and drawing about as long.
 """
 
-import argparse
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -40,6 +38,7 @@ SIZE = 640  # pixels of a picture before it is scaled down, which smooths it
 DRIFT_DEG = (-35.0, 25.0)  # azimuth at the first and at the last step
 ELEVATION_DEG = 18.0
 CPU = torch.device("cpu")
+QUALITY = 85  # of the WebP file, up to 100
 NAMES = {"baseline": "baseline (3DGS)", "cadam": "CAdam"}
 OUTPUT = Path(__file__).parent.parent / "docs" / "images" / "growth.webp"
 
@@ -104,18 +103,6 @@ def train(arm: str, folder: Path) -> Growth:
     return growth
 
 
-def recorded(arm: str, work: Path) -> Growth:
-    """Return the growth of ``arm`` from the folder ``work``, or train if it is not there."""
-    path = work / f"{arm}.npz"
-    if not path.is_file():
-        growth = train(arm, work)
-        np.savez_compressed(
-            path, steps=growth.steps, counts=growth.counts, pictures=np.stack(growth.pictures)
-        )
-    data = np.load(path)
-    return Growth(data["steps"].tolist(), data["counts"].tolist(), list(data["pictures"]))
-
-
 def draw(growths: Sequence[Growth]) -> tuple[list[Image.Image], list[int]]:
     """Return the frames of the animation, and how long each one stays, in milliseconds."""
     frames, grown = [], len(growths[0].steps)
@@ -170,19 +157,11 @@ def write(
 
 def main() -> None:
     """Train both, draw, and write the animation."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--work", type=Path, help="folder that keeps the pictures between calls")
-    parser.add_argument("--quality", type=int, default=85, help="of the WebP file, up to 100")
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as spare:
-        work = options.work or Path(spare)
-        work.mkdir(parents=True, exist_ok=True)
-        frames, durations = draw([recorded(arm, work) for arm in ARMS])
+    with tempfile.TemporaryDirectory() as folder:
+        frames, durations = draw([train(arm, Path(folder)) for arm in ARMS])
     rest = {"append_images": frames[1:], "duration": durations, "loop": 0}
     with replacing(OUTPUT) as temporary:
-        frames[0].save(temporary, save_all=True, quality=options.quality, method=6, **rest)
+        frames[0].save(temporary, save_all=True, quality=QUALITY, method=6, **rest)
     print(f"{OUTPUT}: {len(frames)} frames, {OUTPUT.stat().st_size / 1e6:.2f} MB")
 
 

@@ -114,18 +114,6 @@ def test_a_piece_is_judged_by_its_exit_code_and_its_log(piece, code, log, status
     assert "\n" not in says
 
 
-def test_counters_are_read_for_each_launch():
-    from gpu_run.on_device import read_counters
-
-    text = (
-        '==PROF== Connected\n"ID","Kernel Name","Metric Name","Metric Unit","Metric Value"\n'
-        '"0","sort_count(unsigned int)","Duration","us","8.1"\n'
-        '"0","sort_count(unsigned int)","Something else","","1"\n'
-    )
-    assert read_counters(text) == [{"kernel": "sort_count", "Duration": "8.1 us"}]
-    assert read_counters("==ERROR== ERR_NVGPUCTRPERM") == []
-
-
 def python(name: str, code: str, seconds: float = 60.0, **options) -> Piece:
     """Return a piece that runs some Python; ``out`` is the path of its results."""
     code = f"import json, pathlib, sys; out = pathlib.Path(sys.argv[1])\n{code}"
@@ -147,7 +135,7 @@ def started(tmp_path, monkeypatch):
             python("choice of auto", 'out.write_text(\'{"backend": "cuda"}\')'),
             python("times", f"out.write_text(json.dumps({{'rows': {ROWS}}}))"),
         ],
-        "explains": [python("absent", "", needs=("ncu",))],
+        "explains": [python("absent", "", needs=("nvcc",))],
     }
     monkeypatch.setattr(session, "plan", lambda part, *_: found[part])
     monkeypatch.setattr(session, "STAGES", python("stages", "print('the first wrong stage is x')"))

@@ -17,7 +17,7 @@ DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 MAJOR, MINOR = 75, 76
 # Folders with tools of the CUDA toolkit that are often missing in PATH.
 TOOL_FOLDERS = ("/usr/local/cuda/bin", "/usr/local/cuda/compute-sanitizer", "/opt/cuda/bin")
-TOOLS = ("compute-sanitizer", "ncu", "nvcc", "c++")
+TOOLS = ("compute-sanitizer", "nvcc", "c++")
 # Packages that affect a result by their version, or that are reported if they are missing.
 PACKAGES = ("torch", "numpy", "hydra-core", "omegaconf", "pytest", "pytest-xdist", "gsplat", "ninja")
 PACKAGES += ("imageio-ffmpeg", "diffusers", "nvidia-cuda-nvrtc")

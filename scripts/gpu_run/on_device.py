@@ -4,9 +4,7 @@ A result is a JSON file. Its line ``says`` is what the report quotes.
 """
 
 import argparse
-import csv
 import json
-import subprocess
 import sys
 import time
 import traceback
@@ -18,18 +16,6 @@ SCENES = ((20_000, 512, 1, 0), (100_000, 512, 4, 0), (1_000_000, 1024, 4, 0))
 REPEATS = 10
 # Keys and bits: pairs of 1M Gaussians in 4 views by depth, and their slots by tile at 1024 px.
 SORTS = ((80_000, 32), (400_000, 32), (4_000_000, 32), (16_000_000, 17))
-COUNTED = "regex:blend_|sort_|project_|tile_"
-# Enough kernels for one forward and backward pass.
-COUNTED_KERNELS = 40
-SECTIONS = ("SpeedOfLight", "Occupancy", "LaunchStats", "WarpStateStats")
-METRICS = (
-    "Duration",
-    "Compute (SM) Throughput",
-    "Memory Throughput",
-    "Achieved Occupancy",
-    "Registers Per Thread",
-    "Warp Cycles Per Issued Instruction",
-)
 
 
 def facts() -> dict[str, Any]:
@@ -152,44 +138,6 @@ def compare_sorts(launcher: Any, device: Any, sizes: Any, repeats: int) -> dict[
     return {"says": f"our sort is this many times as fast as torch.sort: {ratios}", "sorts": found}
 
 
-def load() -> dict[str, Any]:
-    """Render and differentiate the largest scene twice, for a profiler."""
-    import torch
-    from rasterizer_bench.scenes import make_scene, make_shell
-
-    from cadam3d.rasterizer.cuda import CudaRasterizer
-
-    count, size, views, degree = SCENES[-1]
-    scene = make_scene(make_shell(count, degree, torch.device("cuda")), size, views)
-    for _ in range(2):
-        scene.zero_grad()
-        scene.backward(scene.render(CudaRasterizer(cache_dir=None)))
-    torch.cuda.synchronize()
-    return {"says": "rendered"}
-
-
-def ncu(tool: str) -> dict[str, Any]:
-    """Count with Nsight Compute what the kernels of the largest scene do."""
-    sections = [word for section in SECTIONS for word in ("--section", section)]
-    command = [tool, "--clock-control", "none", *sections, "-k", COUNTED, "-c", str(COUNTED_KERNELS), "--csv"]
-    command += [sys.executable, "-m", "gpu_run.on_device", "load"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    print(done.stdout, done.stderr)
-    found = read_counters(done.stdout)
-    return {"says": f"counters of {len(found)} launches", "failed": not found, "counters": found}
-
-
-def read_counters(text: str) -> list[dict[str, str]]:
-    """Return the metrics of each launch in the CSV that ``ncu`` prints."""
-    lines = [line for line in text.splitlines() if line.startswith('"')]
-    launches: dict[str, dict[str, str]] = {}
-    for row in csv.DictReader(lines):
-        if row.get("Metric Name") in METRICS:
-            launch = launches.setdefault(row["ID"], {"kernel": row["Kernel Name"].partition("(")[0]})
-            launch[row["Metric Name"]] = f"{row['Metric Value']} {row.get('Metric Unit') or ''}".strip()
-    return list(launches.values())
-
-
 def stages() -> dict[str, Any]:
     """Return which stage of the kernels is the first that is wrong."""
     import torch
@@ -207,8 +155,6 @@ WORK: dict[str, Callable[..., dict[str, Any]]] = {
     "auto": auto,
     "kernels": kernels,
     "sorts": sorts,
-    "load": load,
-    "ncu": ncu,
     "stages": stages,
 }
 
@@ -218,10 +164,9 @@ def main(words: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser("gpu_run.on_device", description=__doc__)
     parser.add_argument("name", choices=WORK)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--tool")
     args = parser.parse_args(words)
     try:
-        result = WORK[args.name](*([args.tool] if args.tool else []))
+        result = WORK[args.name]()
     except Exception as error:
         # Whatever fails on an unknown machine becomes one line of the report; the log has the rest.
         traceback.print_exc()

@@ -136,7 +136,6 @@ def explains(found: Mapping[str, object]) -> list[Piece]:
     return [
         Piece("kernels", own("kernels"), 150.0),
         Piece("sorts", own("sorts"), 60.0),
-        Piece("ncu", own("ncu", "--tool", str(found.get("ncu"))), 120.0, needs=("ncu",)),
         Piece("step", script("bench_step", "--priors", "exact", "--json", RESULT), 60.0),
         Piece(
             "step with a network",
