@@ -119,18 +119,19 @@ def save(
 
 def random_texts(prior: Any) -> None:
     """Replace the text encoders by random embeddings; they run once per prompt and are not part of a step."""
-    from cadam3d.prior.latent import blank_texts
-    from cadam3d.prior.texts import Texts
+    from cadam3d.prior.texts import T5_TOKENS, TOKENS, Texts
 
     def embed_texts(found: Any, texts: list[str], device: torch.device) -> Texts:
-        config = found.skeleton(prior.network_part, prior.torch_dtype).config
-        blank = blank_texts(len(texts), config, prior.torch_dtype)
+        config = found.config(prior.network_part)
+        joint, pooled = config.get("joint_attention_dim"), config.get("pooled_projection_dim")
         generator = torch.Generator().manual_seed(0)
 
-        def drawn(like: torch.Tensor) -> torch.Tensor:
-            return torch.randn(like.shape, generator=generator).to(device, like.dtype)
+        def drawn(*shape: int) -> torch.Tensor:
+            numbers = torch.randn(len(texts), *shape, generator=generator)
+            return numbers.to(device, prior.torch_dtype)
 
-        return Texts(drawn(blank.tokens), None if blank.pooled is None else drawn(blank.pooled))
+        tokens = drawn(TOKENS + (T5_TOKENS if joint else 0), joint or config["cross_attention_dim"])
+        return Texts(tokens, None if pooled is None else drawn(pooled))
 
     object.__setattr__(prior, "embed_texts", embed_texts)
 

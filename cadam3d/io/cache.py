@@ -6,8 +6,6 @@ from pathlib import Path
 
 from cadam3d.core.errors import UserError
 
-# The environment variable with the folder that the jobs of a sweep share.
-TRACES = "CADAM3D_TRACES"
 ROOT = 0  # the number of the user that may write any file
 
 

@@ -62,7 +62,6 @@ TABLE = "sweep.csv"
 PAPER_TABLE_CSV = "table.csv"  # the paper's table 1 of the jobs
 PAPER_TABLE_MARKDOWN = "table.md"
 PAPER_TABLE_LATEX = "table.tex"
-SHARED = "traces"  # a folder, removed after the sweep
 
 # Written by several attempts at one run, beside the files of a sweep.
 BEST = "best"  # a link to the folder of the best attempt
@@ -157,7 +156,7 @@ def occupant(folder: Path) -> str | None:
 def occupant_of_sweep(folder: Path) -> str | None:
     """Return the name of something in ``folder`` that a sweep would overwrite or remove; None if nothing."""
     tables = (TABLE, PAPER_TABLE_CSV, PAPER_TABLE_MARKDOWN, PAPER_TABLE_LATEX)
-    names = (*tables, REPORT, EVALUATION, FIGURES, MULTIRUN, SHARED, STOP, BEST, CHOICE)
+    names = (*tables, REPORT, EVALUATION, FIGURES, MULTIRUN, STOP, BEST, CHOICE)
     return next((name for name in names if os.path.lexists(folder / name)), None)
 
 

@@ -7,7 +7,7 @@ is loaded. Networks compute in ``dtype``; all their outputs are converted to flo
 import gc
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,17 +18,16 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (the usual name)
 from torch.utils.checkpoint import checkpoint
 
-from cadam3d.core.cameras import Cameras, orbit
+from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require, require_choice, require_whole, unless_none
 from cadam3d.core.errors import UserError
 from cadam3d.io.cache import default_cache_dir
 from cadam3d.io.pretrained import DTYPES, VOCABULARY, ModelSource, Pretrained
 from cadam3d.prior.base import Condition, DiffusionPrior, MemoryEstimate, PromptEmbedding
-from cadam3d.prior.memory import working_bytes
 from cadam3d.prior.path import DDPM, NoisePath, Prediction, Rows
 from cadam3d.prior.prompting import Mix, Prompting, guide
 from cadam3d.prior.shapes.lexicon import Lexicon
-from cadam3d.prior.texts import T5_TOKENS, TOKENS, TextCache, Texts
+from cadam3d.prior.texts import TextCache, Texts
 
 # What to type for a model of each pipeline class.
 PRIORS = {
@@ -43,6 +42,9 @@ FACTOR = 8  # pixels per side
 LEVELS = ("table", "any")
 # A network recognises nothing in images of more than this many times the size of those in its training.
 LARGEST = 2
+# Numbers that the autoencoder keeps for a backward pass, per pixel and per channel of its first layer. All
+# models of this family have the same layers.
+KEPT = 24
 
 
 @dataclass(frozen=True)
@@ -208,26 +210,26 @@ class LatentPrior(DiffusionPrior):
     def memory(self, prompt: str, negative: str, views: int, size: int | None) -> MemoryEstimate:
         """Estimate the memory of training from the configuration of the model alone.
 
-        The working memory is what the denoiser or the autoencoder needs, whichever is larger. Renders have
-        ``size`` pixels per side (512 if that is None too) unless the prior resizes them. Raises ``UserError``
-        in the cases in which :meth:`embed` does, since training calls this first.
+        The working memory is what the autoencoder keeps for the backward pass; the denoiser has no gradient
+        and needs less. Renders have ``size`` pixels per side (512 if that is None too) unless the prior
+        resizes them. Raises ``UserError`` in the cases in which :meth:`embed` does, since training calls this
+        first.
         """
         self._require_readable(prompt, negative)
         pixels = self.size or size or 512
-        branches = 2 + self.prompting.mix(_views(1)).repelled.shape[1]
         vae = self.found.skeleton("vae", self._vae_dtype)
         network = self.found.skeleton(self.network_part, self.torch_dtype)
-        working = max(
-            self._denoising(network, self._at_once(views * branches), vae.config.latent_channels, pixels),
-            _encoding(vae, self._at_once(views), pixels),
-        )
+        numbers = self._at_once(views) * pixels**2 * vae.config.block_out_channels[0] * KEPT
         is_known = all(map(self._cache.has, self._listed(prompt, negative)))
         is_elsewhere = self.text_device == "cpu" and self.device.type != "cpu"
         encoders = [part for part in self.encoders if self.found.has(part)]
         if is_known or is_elsewhere:
             encoders = []
-        texts = sum(_weights(self.found.skeleton(part, self.torch_dtype)) for part in encoders)
-        return MemoryEstimate(weights=_weights(vae) + _weights(network), working=working, texts=texts)
+        return MemoryEstimate(
+            weights=_weights(vae) + _weights(network),
+            working=numbers * self._vae_dtype.itemsize,
+            texts=sum(_weights(self.found.skeleton(part, self.torch_dtype)) for part in encoders),
+        )
 
     def lacks(self) -> str | None:
         """Return why the model cannot be used yet: libraries, ``path`` or weights; None if it is ready."""
@@ -395,20 +397,6 @@ class LatentPrior(DiffusionPrior):
     def _listed(self, prompt: str, negative: str) -> list[str]:
         return [*self.prompting.texts(prompt), negative, ""]
 
-    def _denoising(self, network: Any, count: int, channels: int, pixels: int) -> int:
-        """Return the scratch bytes of one pass of a skeleton of the denoiser over ``count`` images."""
-        # A copy of this prior with a network that has shapes and no numbers.
-        ghost = replace(self)
-        object.__setattr__(ghost, "network", network)
-        side = pixels // FACTOR
-        with torch.device("meta"):
-            noisy = torch.empty(count, channels, side, side, dtype=self.torch_dtype)
-            timestep = torch.empty(count)
-            texts = blank_texts(count, network.config, self.torch_dtype)
-        cameras = _views(count).to("meta")
-        with torch.no_grad():
-            return working_bytes(lambda: ghost.denoise(noisy, timestep, texts, cameras), network.parameters())
-
     def _embed(self, texts: Sequence[str]) -> Texts:
         device = torch.device("cpu") if self.text_device == "cpu" else self.device
         made = self.embed_texts(self.found, texts, device)
@@ -446,17 +434,6 @@ def ddpm_path(scheduler: Mapping[str, Any]) -> NoisePath:
     )
 
 
-def blank_texts(count: int, config: Any, dtype: torch.dtype) -> Texts:
-    """Return texts without content, in the shapes that a denoiser with this configuration reads."""
-    joint = getattr(config, "joint_attention_dim", None)
-    tokens = torch.empty(count, TOKENS + (T5_TOKENS if joint else 0), joint or config.cross_attention_dim)
-    width = getattr(config, "pooled_projection_dim", None)
-    # SDXL: the pooled text is followed by the embeddings of six numbers about image sizes.
-    if getattr(config, "addition_embed_type", None) == "text_time":
-        width = config.projection_class_embeddings_input_dim - 6 * config.addition_time_embed_dim
-    return Texts(tokens.to(dtype), None if width is None else torch.empty(count, width).to(dtype))
-
-
 Complete = Callable[[Tensor, Tensor, Tensor], Prediction]
 
 
@@ -478,17 +455,5 @@ def completion(path: NoisePath, scheduler: Mapping[str, Any]) -> Complete:
     return ways[kind]
 
 
-def _encoding(vae: Any, count: int, pixels: int) -> int:
-    """Return the bytes that a skeleton of the autoencoder keeps for a backward pass over ``count`` images."""
-    with torch.device("meta"):
-        images = torch.empty(count, 3, pixels, pixels, dtype=vae.dtype, requires_grad=True)
-    return working_bytes(lambda: vae.encode(images).latent_dist.mode(), vae.parameters())  # noqa: PLW0108
-
-
 def _weights(network: Any) -> int:
     return sum(parameter.numel() * parameter.element_size() for parameter in network.parameters())
-
-
-def _views(count: int) -> Cameras:
-    zeros = torch.zeros(count)
-    return orbit(zeros, zeros, zeros + 3, zeros + 45, FACTOR, FACTOR)

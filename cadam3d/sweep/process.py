@@ -18,11 +18,10 @@ from functools import cache
 from pathlib import Path
 
 from cadam3d.core.outcome import Outcome
-from cadam3d.io.cache import TRACES
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.lock import INHERITED, describe_holder, take, unlock
 from cadam3d.io.records import read_summary
-from cadam3d.io.run_folder import CONSOLE, ENDED, LOCK, RUN_FOLDER, SHARED, STOP, SUMMARY
+from cadam3d.io.run_folder import CONSOLE, ENDED, LOCK, RUN_FOLDER, STOP, SUMMARY
 from cadam3d.settings.compose import quote
 from cadam3d.sweep.folder import Plan, Row, is_complete, read_plan, rows_of
 
@@ -116,9 +115,6 @@ def _wait(plan: Plan, row: Row, stop: Path, lock: int) -> int:
     # Hydra's main function sets this in the process of the sweep. A job prints a mistake of the user without
     # a traceback.
     environment.pop("HYDRA_FULL_ERROR", None)
-    # Attempts have different seeds, so none of them could read the traces of another one.
-    if plan.command == "sweep":
-        environment.setdefault(TRACES, str(stop.with_name(SHARED)))
     environment[INHERITED] = str(lock)
     if Path(plan.cwd) == PACKAGE_ROOT:
         # A checkout that is not installed is found in the current folder only.

@@ -5,7 +5,6 @@ The same line always has the same folder, so typing the line again continues the
 
 import os
 import shlex
-import shutil
 import signal
 import sys
 from collections import Counter
@@ -28,7 +27,6 @@ from cadam3d.io.run_folder import (
     CONSOLE,
     LOCK,
     OVERRIDES,
-    SHARED,
     STOP,
     TABLE,
     claim,
@@ -97,7 +95,6 @@ def run_sweep(
             with reporting(rows):
                 problem = _launch(sweep, rows, flags)
         finally:
-            shutil.rmtree(folder / SHARED, ignore_errors=True)
             code = _report_results(sweep, write_table(folder), problem)
     if stop.received is not None:
         return Ended(folder, 128 + stop.received, was_stopped=True)

@@ -27,9 +27,7 @@ note = {{"folder": folder.name, "words": sys.argv[5:], "threads": os.environ.get
 note["pid"] = os.getpid()
 same_job = [call["pid"] for call in earlier if call["folder"] == folder.name]
 note["running"] = [pid for pid in same_job if is_running(pid)]
-note["traces"], note["path"] = os.environ.get("CADAM3D_TRACES"), os.environ.get("PYTHONPATH")
-if note["traces"]:
-    os.makedirs(note["traces"], exist_ok=True)
+note["path"] = os.environ.get("PYTHONPATH")
 note["files"] = sorted(path.name for path in folder.iterdir())
 with log.open("a") as file:
     file.write(json.dumps(note) + "\n")

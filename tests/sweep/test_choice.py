@@ -194,7 +194,6 @@ def test_a_job_is_a_single_run_without_the_settings_of_the_attempts(train, calls
     assert words[:3] == ["train", "prompt='an attempt'", "steps=7"]
     assert words[3] == "seed=1"
     assert not any(word.startswith(("attempts=", "select=", "launcher")) for word in words)
-    assert calls(only_folder())[1]["traces"] is None  # no other seed could use them
 
 
 def test_attempts_of_a_recipe_do_not_start_attempts(train, calls):

@@ -142,13 +142,6 @@ def test_the_table_has_one_row_per_job(hydra_sweep):
     assert all((only_sweep() / row["folder"] / "summary.json").is_file() for row in rows)
 
 
-def test_jobs_share_a_folder_for_traces_that_is_removed_after_the_sweep(sweep, calls):
-    sweep("prompt=a cube", "seed=0,1")
-    folder = only_sweep()
-    assert {call["traces"] for call in calls(folder)} == {str(folder.resolve() / "traces")}
-    assert not (folder / "traces").exists()
-
-
 def test_each_job_is_reported_as_it_ends(sweep):
     lines = sweep("prompt=a cube", "seed=0,1,2").out.splitlines()
     assert lines[0].startswith("3 jobs in multirun/")

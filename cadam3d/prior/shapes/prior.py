@@ -18,7 +18,7 @@ from cadam3d.prior.shapes.mixture import Mixture
 from cadam3d.prior.shapes.objects import known_objects, known_primitives
 from cadam3d.prior.shapes.scene import Scene, build, signed_distance
 from cadam3d.prior.shapes.tracer import Layers
-from cadam3d.prior.shapes.tracing import TRACERS, find_tracer, shared_trace, stored_arrays
+from cadam3d.prior.shapes.tracing import TRACERS, find_tracer, stored_arrays, tracer_for
 
 CENSUS_VIEWS = 4  # per object, equally spaced in azimuth
 CENSUS_ELEVATION_DEG = 15.0
@@ -214,7 +214,7 @@ def true_scene(scene: Scene, samples_per_pixel: int, turns: int | None = None, t
 def _traced(scene: Scene, cameras: Cameras, samples: int, tracer: str) -> tuple[Layers, Scene]:
     """Return the rendered scene, and the scene on the device and in the dtype of the cameras."""
     scene = scene.to(cameras.intrinsics.device, cameras.intrinsics.dtype)
-    return shared_trace(scene, cameras, samples, tracer), scene
+    return tracer_for(tracer, cameras).trace(scene, cameras, samples), scene
 
 
 def error_field(image: Float[Tensor, "v c h w"], seed: int) -> Float[Tensor, "v c h w"]:
@@ -295,7 +295,7 @@ def _measure(size: int, tracer: str) -> dict[str, Tensor]:
     names = (*known_primitives(), *known_objects())
     for name in names:
         scene = build(name).to(torch.device("cpu"), torch.float32)
-        layers = shared_trace(scene, cameras, 1, tracer)
+        layers = find_tracer(tracer).trace(scene, cameras, 1)
         images = layers.images(scene.albedo, black).double()
         alpha = layers.alpha.double()
         rgb_sum += images.mean(dim=(0, 1))
