@@ -68,6 +68,10 @@ class Thing:
     shelter: tuple[float, float] | None = None  # radius and height of the room for objects under it
 
 
+# A colour or a coat, and the solids that have it.
+Group = tuple[str | Coat, *tuple[Solid, ...]]
+
+
 def bounds(parts: tuple[Part, ...]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
     """Return the low and the high corner of the tight box around all parts."""
     reach = torch.stack([part.solid.support(UNIT_AXES) for part in parts]).amax(0)
@@ -97,18 +101,17 @@ def known_objects() -> tuple[str, ...]:
 def thing(name: str) -> Thing:
     """Return the object of that name, a key of PRIMITIVES or COMPOSED."""
     if name in PRIMITIVES:
-        return Thing(_painted(MAIN, PRIMITIVES[name]), OPEN, "white")
+        return _thing(OPEN, "white", 1.0, (MAIN, PRIMITIVES[name]))
     return COMPOSED[name]()
 
 
-def _painted(colour: str, *solids: Solid) -> tuple[Part, ...]:
-    """Return parts of one colour."""
-    return tuple(Part(solid, Coat(colour, ACCENT)) for solid in solids)
-
-
-def _thing(main: str, accent: str, natural: float, *groups: tuple[Part, ...], **room: Any) -> Thing:
-    """Return the object of these groups of parts. The order of parts of one kind decides the last bits."""
-    return Thing(tuple(part for group in groups for part in group), main, accent, natural, **room)
+def _thing(main: str, accent: str, natural: float, *groups: Group, **room: Any) -> Thing:
+    """Return the object of these groups. The order of parts of one kind decides the last bits."""
+    parts = []
+    for colour, *solids in groups:
+        coat = colour if isinstance(colour, Coat) else Coat(colour, ACCENT)
+        parts += [Part(solid, coat) for solid in solids]
+    return Thing(tuple(parts), main, accent, natural, **room)
 
 
 def _lighthouse() -> Thing:
@@ -122,7 +125,7 @@ def _lighthouse() -> Thing:
     for i in range(bands):
         bottom, top = base + height * i / bands, base + height * (i + 1) / bands
         slab = frustum(radius(bottom), radius(top), top - bottom).at(z=(bottom + top) / 2)
-        tower.append(_painted(ACCENT if i % 2 else MAIN, slab))
+        tower.append((ACCENT if i % 2 else MAIN, slab))
     deck = base + height
     rail = [cylinder(0.016, 0.16).at(0.35).turned("z", 45.0 * i).at(z=deck + 0.12) for i in range(8)]
     bars = [cylinder(0.02, 0.30).at(0.17).turned("z", 60.0 * i).at(z=deck + 0.20) for i in range(6)]
@@ -135,8 +138,8 @@ def _lighthouse() -> Thing:
         "white",
         1.8,
         *tower,
-        _painted("grey", ellipsoid(0.72, 0.70, 0.20)),
-        _painted(
+        ("grey", ellipsoid(0.72, 0.70, 0.20)),
+        (
             "charcoal",
             ellipsoid(0.26, 0.22, 0.20).at(0.42, 0.40, 0.05),
             ellipsoid(0.24, 0.27, 0.17).at(-0.42, -0.36, 0.06),
@@ -145,15 +148,15 @@ def _lighthouse() -> Thing:
             torus(0.35, 0.018).at(z=deck + 0.19),
             ball(0.045).at(z=deck + 0.60),
         ),
-        _painted("yellow", cylinder(0.17, 0.30).at(z=deck + 0.20)),
-        _painted(MAIN, cone(0.27, 0.24).at(z=deck + 0.46)),
-        _painted("charcoal", *rail, *bars),
-        _painted(
+        ("yellow", cylinder(0.17, 0.30).at(z=deck + 0.20)),
+        (MAIN, cone(0.27, 0.24).at(z=deck + 0.46)),
+        ("charcoal", *rail, *bars),
+        (
             "brown",
             box(0.10, 0.17, 0.26).at(0.37, 0, base + 0.17),
             cylinder(0.085, 0.10).turned("y", 90).at(0.37, 0, base + 0.30),
         ),
-        _painted("navy", *windows),
+        ("navy", *windows),
     )
 
 
@@ -167,22 +170,22 @@ def _snowman() -> Thing:
         "white",
         "red",
         1.0,
-        _painted(MAIN, ball(0.50).at(z=0.46), ball(0.37).at(z=1.03), ball(0.27).at(z=head)),
-        _painted("orange", cone(0.07, 0.34).turned("y", 90).at(0.40, 0, head)),
-        _painted(
+        (MAIN, ball(0.50).at(z=0.46), ball(0.37).at(z=1.03), ball(0.27).at(z=head)),
+        ("orange", cone(0.07, 0.34).turned("y", 90).at(0.40, 0, head)),
+        (
             "black",
             *eyes,
             *buttons,
             cylinder(0.31, 0.045).at(z=head + 0.215),
             cylinder(0.20, 0.30).at(z=head + 0.37),
         ),
-        _painted(
+        (
             ACCENT,
             cylinder(0.207, 0.07).at(z=head + 0.275),
             torus(0.25, 0.065).at(z=1.225),
             box(0.07, 0.12, 0.30).turned("y", -8).at(0.37, 0.16, 1.06),
         ),
-        _painted("brown", *arms, *hands),
+        ("brown", *arms, *hands),
     )
 
 
@@ -195,10 +198,10 @@ def _chair() -> Thing:
         "orange",
         "brown",
         0.9,
-        _painted(MAIN, box(0.84, 0.86, 0.11).at(0.01, 0, 0.66)),
-        _painted(ACCENT, *legs, *posts),
-        _painted(MAIN, *slats),
-        _painted(ACCENT, *rungs),
+        (MAIN, box(0.84, 0.86, 0.11).at(0.01, 0, 0.66)),
+        (ACCENT, *legs, *posts),
+        (MAIN, *slats),
+        (ACCENT, *rungs),
         seat=0.715,
         shelter=(0.25, 0.60),
     )
@@ -208,8 +211,8 @@ def _table() -> Thing:
     legs = [box(0.13, 0.13, 0.80).at(x, y, 0.40) for x in (-0.50, 0.50) for y in (-0.80, 0.80)]
     aprons = [box(0.06, 1.55, 0.15).at(x, 0, 0.72) for x in (-0.50, 0.50)]
     ends = [box(0.95, 0.06, 0.15).at(0, y, 0.72) for y in (-0.80, 0.80)]
-    top = _painted(MAIN, box(1.30, 1.95, 0.10).at(z=0.84))
-    rest = _painted(ACCENT, *legs, *aprons, *ends)
+    top = (MAIN, box(1.30, 1.95, 0.10).at(z=0.84))
+    rest = (ACCENT, *legs, *aprons, *ends)
     return _thing("beige", "brown", 1.4, top, rest, shelter=(0.42, 0.63))
 
 
@@ -219,9 +222,9 @@ def _mug() -> Thing:
         "blue",
         "white",
         0.45,
-        _painted(MAIN, tube(0.45, 0.38, 0.98).at(z=0.50), cylinder(0.44, 0.10).at(z=0.06), handle),
-        _painted("brown", cylinder(0.385, 0.05).at(z=0.80)),
-        _painted(ACCENT, torus(0.415, 0.045).at(z=0.99)),
+        (MAIN, tube(0.45, 0.38, 0.98).at(z=0.50), cylinder(0.44, 0.10).at(z=0.06), handle),
+        ("brown", cylinder(0.385, 0.05).at(z=0.80)),
+        (ACCENT, torus(0.415, 0.045).at(z=0.99)),
         seat=1.0,
     )
 
@@ -233,8 +236,8 @@ def _rocket() -> Thing:
         "white",
         "red",
         1.6,
-        _painted(MAIN, cylinder(0.33, 1.10).at(z=0.80), frustum(0.33, 0.21, 0.36).at(z=1.53)),
-        _painted(
+        (MAIN, cylinder(0.33, 1.10).at(z=0.80), frustum(0.33, 0.21, 0.36).at(z=1.53)),
+        (
             ACCENT,
             cone(0.21, 0.44).at(z=1.93),
             cylinder(0.338, 0.07).at(z=1.34),
@@ -244,9 +247,9 @@ def _rocket() -> Thing:
             *fins,
             *tips,
         ),
-        _painted("charcoal", frustum(0.28, 0.20, 0.20).at(z=0.16)),
-        _painted("orange", cone(0.19, 0.38).turned("y", 180).at(z=-0.13)),
-        _painted(
+        ("charcoal", frustum(0.28, 0.20, 0.20).at(z=0.16)),
+        ("orange", cone(0.19, 0.38).turned("y", 180).at(z=-0.13)),
+        (
             "cyan",
             ellipsoid(0.04, 0.105, 0.105).at(0.32, 0, 1.05),
             ellipsoid(0.04, 0.08, 0.08).at(0.32, 0, 0.70),
@@ -255,32 +258,30 @@ def _rocket() -> Thing:
 
 
 def _house() -> Thing:
-    def window(x: float, y: float, turn: float) -> tuple[Part, ...]:
-        frame, pane, *bars = (
-            solid.turned("z", turn).at(x, y, 0.45)
-            for solid in (
-                box(0.05, 0.34, 0.34),
-                box(0.07, 0.27, 0.27),
-                box(0.085, 0.27, 0.03),
-                box(0.085, 0.03, 0.27),
-            )
+    sides = [(x, y, 0.0) for x, y in ((0.61, -0.42), (0.61, 0.42), (-0.61, -0.36), (-0.61, 0.36))]
+    windows = [
+        (colour, solid.turned("z", turn).at(x, y, 0.45))
+        for x, y, turn in (*sides, (0.0, 0.76, 90.0), (0.0, -0.76, 90.0))
+        for colour, solid in (
+            ("white", box(0.05, 0.34, 0.34)),
+            ("navy", box(0.07, 0.27, 0.27)),
+            ("white", box(0.085, 0.27, 0.03)),
+            ("white", box(0.085, 0.03, 0.27)),
         )
-        return _painted("white", frame) + _painted("navy", pane) + _painted("white", *bars)
-
+    ]
     loft = gable(1.50, 1.50, 0.62).stretched(0.8, 1.0, 1.0).turned("z", 90).stretched(1, 1.25, 1)
     return _thing(
         "cream",
         "red",
         1.7,
-        _painted(MAIN, box(1.20, 1.50, 0.86).at(z=0.43), loft.at(z=1.16)),
-        _painted(ACCENT, gable(1.72, 1.52, 0.68).turned("z", 90).at(z=1.20)),
-        _painted("maroon", box(0.22, 0.22, 0.62).at(-0.28, 0.45, 1.43)),
-        _painted("charcoal", box(0.27, 0.27, 0.07).at(-0.28, 0.45, 1.75)),
-        _painted("brown", box(0.06, 0.28, 0.52).at(0.61, 0, 0.26)),
-        _painted("gold", ball(0.025).at(0.65, 0.09, 0.26)),
-        _painted("grey", box(0.26, 0.40, 0.06).at(0.68, 0, 0.03)),
-        *(window(x, y, 0.0) for x, y in ((0.61, -0.42), (0.61, 0.42), (-0.61, -0.36), (-0.61, 0.36))),
-        *(window(0.0, y, 90.0) for y in (0.76, -0.76)),
+        (MAIN, box(1.20, 1.50, 0.86).at(z=0.43), loft.at(z=1.16)),
+        (ACCENT, gable(1.72, 1.52, 0.68).turned("z", 90).at(z=1.20)),
+        ("maroon", box(0.22, 0.22, 0.62).at(-0.28, 0.45, 1.43)),
+        ("charcoal", box(0.27, 0.27, 0.07).at(-0.28, 0.45, 1.75)),
+        ("brown", box(0.06, 0.28, 0.52).at(0.61, 0, 0.26)),
+        ("gold", ball(0.025).at(0.65, 0.09, 0.26)),
+        ("grey", box(0.26, 0.40, 0.06).at(0.68, 0, 0.03)),
+        *windows,
     )
 
 
@@ -312,15 +313,15 @@ def _tree() -> Thing:
         "green",
         "red",
         1.6,
-        _painted(MAIN, *leaves),
-        _painted(
+        (MAIN, *leaves),
+        (
             "brown",
             frustum(0.20, 0.12, 1.05).at(z=0.52),
             capsule(0.055, 0.60).turned("x", -40).at(0, 0.20, 0.86),
             capsule(0.05, 0.55).turned("x", 42).at(0, -0.19, 0.84),
             *roots,
         ),
-        _painted(ACCENT, *fruits),
+        (ACCENT, *fruits),
     )
 
 
@@ -330,9 +331,9 @@ def _pine() -> Thing:
         "green",
         "yellow",
         1.6,
-        _painted(MAIN, *(cone(radius, height).at(z=z) for radius, height, z in tiers)),
-        _painted("brown", cylinder(0.11, 0.44).at(z=0.20)),
-        _painted(ACCENT, star(0.14, 0.06, 0.05).at(z=1.90)),
+        (MAIN, *(cone(radius, height).at(z=z) for radius, height, z in tiers)),
+        ("brown", cylinder(0.11, 0.44).at(z=0.20)),
+        (ACCENT, star(0.14, 0.06, 0.05).at(z=1.90)),
     )
 
 
@@ -341,9 +342,9 @@ def _hammer() -> Thing:
         "grey",
         "brown",
         0.8,
-        _painted(ACCENT, capsule(0.075, 1.50).at(z=0.75)),
-        _painted("charcoal", cylinder(0.09, 0.42).at(z=0.22)),
-        _painted(
+        (ACCENT, capsule(0.075, 1.50).at(z=0.75)),
+        ("charcoal", cylinder(0.09, 0.42).at(z=0.22)),
+        (
             MAIN,
             box(0.24, 0.44, 0.26).at(z=1.42),
             cylinder(0.10, 0.24).turned("x", 90).at(0, -0.30, 1.42),
@@ -359,16 +360,16 @@ def _mushroom() -> Thing:
         "red",
         "cream",
         0.7,
-        _painted(ACCENT, frustum(0.21, 0.16, 0.82).at(z=0.38), ellipsoid(0.27, 0.27, 0.13).at(z=0.06)),
-        _painted("beige", frustum(0.20, 0.54, 0.10).at(z=0.72)),
-        _painted(MAIN, ellipsoid(0.60, 0.60, 0.09).at(z=0.82), ellipsoid(0.56, 0.56, 0.42).at(z=0.86)),
-        _painted("white", frustum(0.30, 0.17, 0.10).at(z=0.60)),
+        (ACCENT, frustum(0.21, 0.16, 0.82).at(z=0.38), ellipsoid(0.27, 0.27, 0.13).at(z=0.06)),
+        ("beige", frustum(0.20, 0.54, 0.10).at(z=0.72)),
+        (MAIN, ellipsoid(0.60, 0.60, 0.09).at(z=0.82), ellipsoid(0.56, 0.56, 0.42).at(z=0.86)),
+        ("white", frustum(0.30, 0.17, 0.10).at(z=0.60)),
     )
 
 
 def _car() -> Thing:
     wheels = [
-        _painted(colour, cylinder(radius, width).turned("x", 90).at(x, 0.40 * side, 0.20))
+        (colour, cylinder(radius, width).turned("x", 90).at(x, 0.40 * side, 0.20))
         for x in (-0.55, 0.55)
         for side in (-1, 1)
         for colour, radius, width in (("black", 0.20, 0.16), ("silver", 0.10, 0.18))
@@ -377,14 +378,14 @@ def _car() -> Thing:
         "red",
         "white",
         1.2,
-        _painted(MAIN, box(1.80, 0.84, 0.34).at(z=0.38)),
-        _painted("navy", frustum(0.62, 0.42, 0.44).stretched(y=0.66).at(-0.10, 0, 0.74)),
-        _painted(ACCENT, cylinder(0.44, 0.07).stretched(y=0.68).at(-0.10, 0, 0.96)),
+        (MAIN, box(1.80, 0.84, 0.34).at(z=0.38)),
+        ("navy", frustum(0.62, 0.42, 0.44).stretched(y=0.66).at(-0.10, 0, 0.74)),
+        (ACCENT, cylinder(0.44, 0.07).stretched(y=0.68).at(-0.10, 0, 0.96)),
         *wheels,
-        _painted("yellow", *(ellipsoid(0.05, 0.09, 0.07).at(0.90, y, 0.44) for y in (-0.28, 0.28))),
-        _painted("maroon", *(box(0.05, 0.16, 0.09).at(-0.90, y, 0.44) for y in (-0.28, 0.28))),
-        _painted("charcoal", box(0.06, 0.34, 0.10).at(0.89, 0, 0.36)),
-        _painted("silver", *(box(0.08, 0.88, 0.09).at(x, 0, 0.26) for x in (-0.89, 0.89))),
+        ("yellow", *(ellipsoid(0.05, 0.09, 0.07).at(0.90, y, 0.44) for y in (-0.28, 0.28))),
+        ("maroon", *(box(0.05, 0.16, 0.09).at(-0.90, y, 0.44) for y in (-0.28, 0.28))),
+        ("charcoal", box(0.06, 0.34, 0.10).at(0.89, 0, 0.36)),
+        ("silver", *(box(0.08, 0.88, 0.09).at(x, 0, 0.26) for x in (-0.89, 0.89))),
     )
 
 
@@ -392,35 +393,35 @@ def _robot() -> Thing:
     limbs = []
     for side in (-1, 1):
         limbs += [
-            _painted(
+            (
                 MAIN,
                 box(0.18, 0.16, 0.52).at(0, 0.52 * side, 0.84),
                 box(0.20, 0.20, 0.46).at(0, 0.19 * side, 0.26),
             ),
-            _painted(
+            (
                 "charcoal",
                 cylinder(0.10, 0.30).turned("x", 90).at(0, 0.40 * side, 1.02),
                 box(0.36, 0.25, 0.12).at(0.05, 0.19 * side, 0.06),
             ),
-            _painted(ACCENT, ball(0.12).at(0, 0.52 * side, 0.52)),
-            _painted("yellow", cylinder(0.075, 0.06).turned("y", 90).at(0.24, 0.13 * side, 1.46)),
-            _painted("charcoal", cylinder(0.06, 0.08).turned("x", 90).at(0, 0.33 * side, 1.42)),
+            (ACCENT, ball(0.12).at(0, 0.52 * side, 0.52)),
+            ("yellow", cylinder(0.075, 0.06).turned("y", 90).at(0.24, 0.13 * side, 1.46)),
+            ("charcoal", cylinder(0.06, 0.08).turned("x", 90).at(0, 0.33 * side, 1.42)),
         ]
     buttons = zip(("red", "yellow", "green"), (-0.11, 0.0, 0.11), strict=True)
     return _thing(
         "silver",
         "red",
         1.2,
-        _painted(MAIN, box(0.46, 0.70, 0.66).at(z=0.80), box(0.46, 0.58, 0.46).at(z=1.42)),
-        _painted(ACCENT, box(0.04, 0.40, 0.32).at(0.23, 0, 0.86)),
-        *(_painted(colour, ball(0.05).at(0.25, y, 0.92)) for colour, y in buttons),
-        _painted(
+        (MAIN, box(0.46, 0.70, 0.66).at(z=0.80), box(0.46, 0.58, 0.46).at(z=1.42)),
+        (ACCENT, box(0.04, 0.40, 0.32).at(0.23, 0, 0.86)),
+        *((colour, ball(0.05).at(0.25, y, 0.92)) for colour, y in buttons),
+        (
             "charcoal",
             cylinder(0.10, 0.14).at(z=1.16),
             box(0.05, 0.32, 0.07).at(0.225, 0, 1.30),
             cylinder(0.02, 0.22).at(z=1.74),
         ),
-        _painted(ACCENT, ball(0.06).at(z=1.87)),
+        (ACCENT, ball(0.06).at(z=1.87)),
         *limbs,
     )
 
@@ -430,10 +431,10 @@ def _lamp() -> Thing:
         "yellow",
         "blue",
         0.9,
-        _painted(ACCENT, cylinder(0.36, 0.08).at(z=0.04), ellipsoid(0.20, 0.20, 0.30).at(z=0.34)),
-        _painted("gold", cylinder(0.045, 0.60).at(z=0.80), ball(0.06).at(z=1.64)),
-        _painted(MAIN, frustum(0.58, 0.34, 0.60).at(z=1.28)),
-        _painted("white", torus(0.575, 0.025).at(z=0.99), torus(0.345, 0.025).at(z=1.57)),
+        (ACCENT, cylinder(0.36, 0.08).at(z=0.04), ellipsoid(0.20, 0.20, 0.30).at(z=0.34)),
+        ("gold", cylinder(0.045, 0.60).at(z=0.80), ball(0.06).at(z=1.64)),
+        (MAIN, frustum(0.58, 0.34, 0.60).at(z=1.28)),
+        ("white", torus(0.575, 0.025).at(z=0.99), torus(0.345, 0.025).at(z=1.57)),
     )
 
 
@@ -442,19 +443,19 @@ def _boat() -> Thing:
         "blue",
         "white",
         1.3,
-        _painted(
+        (
             MAIN,
             box(1.10, 0.62, 0.34).at(-0.15, 0, 0.27),
             pyramid(0.34, 0.62, 0.62).turned("y", 90).at(0.70, 0, 0.27),
         ),
-        _painted(
+        (
             ACCENT,
             box(1.14, 0.66, 0.06).at(-0.15, 0, 0.46),
             pyramid(1.00, 0.05, 1.25).at(-0.10, 0, 1.28),
             pyramid(0.62, 0.04, 0.95).at(0.42, 0, 1.10),
         ),
-        _painted("brown", cylinder(0.045, 1.70).at(0.10, 0, 1.15), box(0.36, 0.34, 0.20).at(-0.42, 0, 0.56)),
-        _painted("red", box(0.26, 0.03, 0.14).at(-0.03, 0, 1.93)),
+        ("brown", cylinder(0.045, 1.70).at(0.10, 0, 1.15), box(0.36, 0.34, 0.20).at(-0.42, 0, 0.56)),
+        ("red", box(0.26, 0.03, 0.14).at(-0.03, 0, 1.93)),
     )
 
 
@@ -463,10 +464,10 @@ def _castle() -> Thing:
     for x in (-0.60, 0.60):
         for y in (-0.60, 0.60):
             towers += [
-                _painted(MAIN, cylinder(0.22, 1.05).at(x, y, 0.52)),
-                _painted("grey", cylinder(0.26, 0.10).at(x, y, 1.06)),
-                _painted(ACCENT, cone(0.29, 0.46).at(x, y, 1.33)),
-                _painted("charcoal", box(0.06, 0.07, 0.16).at(x + (0.20 if x > 0 else -0.20), y, 0.74)),
+                (MAIN, cylinder(0.22, 1.05).at(x, y, 0.52)),
+                ("grey", cylinder(0.26, 0.10).at(x, y, 1.06)),
+                (ACCENT, cone(0.29, 0.46).at(x, y, 1.33)),
+                ("charcoal", box(0.06, 0.07, 0.16).at(x + (0.20 if x > 0 else -0.20), y, 0.74)),
             ]
     edges = [(a, b) for a in (-0.60, 0.60) for b in (-0.26, 0.0, 0.26)]
     merlons = [box(0.12, 0.13, 0.13).at(x, y, 0.74) for x, y in (*edges, *((b, a) for a, b in edges))]
@@ -474,15 +475,15 @@ def _castle() -> Thing:
         "beige",
         "blue",
         1.8,
-        _painted(MAIN, box(1.30, 1.30, 0.68).at(z=0.34), box(0.56, 0.56, 1.00).at(z=0.90)),
-        _painted(ACCENT, pyramid(0.70, 0.70, 0.56).at(z=1.67)),
-        _painted(
+        (MAIN, box(1.30, 1.30, 0.68).at(z=0.34), box(0.56, 0.56, 1.00).at(z=0.90)),
+        (ACCENT, pyramid(0.70, 0.70, 0.56).at(z=1.67)),
+        (
             "brown",
             box(0.06, 0.34, 0.34).at(0.64, 0, 0.17),
             cylinder(0.17, 0.06).turned("y", 90).at(0.64, 0, 0.34),
         ),
-        _painted("charcoal", *(box(0.06, 0.10, 0.18).at(x, 0, 1.14) for x in (-0.27, 0.27))),
-        _painted(MAIN, *merlons),
+        ("charcoal", *(box(0.06, 0.10, 0.18).at(x, 0, 1.14) for x in (-0.27, 0.27))),
+        (MAIN, *merlons),
         *towers,
     )
 
@@ -498,10 +499,10 @@ def _cactus() -> Thing:
         "green",
         "orange",
         0.8,
-        _painted(MAIN, capsule(0.20, 1.30).at(z=0.92), *arms),
-        _painted("pink", ellipsoid(0.08, 0.08, 0.05).at(z=1.57)),
-        _painted(ACCENT, frustum(0.26, 0.36, 0.40).at(z=0.20), tube(0.41, 0.30, 0.10).at(z=0.40)),
-        _painted("brown", cylinder(0.33, 0.02).at(z=0.41)),
+        (MAIN, capsule(0.20, 1.30).at(z=0.92), *arms),
+        ("pink", ellipsoid(0.08, 0.08, 0.05).at(z=1.57)),
+        (ACCENT, frustum(0.26, 0.36, 0.40).at(z=0.20), tube(0.41, 0.30, 0.10).at(z=0.40)),
+        ("brown", cylinder(0.33, 0.02).at(z=0.41)),
     )
 
 
@@ -513,21 +514,21 @@ def _flower() -> Thing:
         "pink",
         "yellow",
         0.7,
-        _painted(MAIN, *petals),
-        _painted(ACCENT, ellipsoid(0.13, 0.20, 0.20).at(0.03, 0, 1.30)),
-        _painted(
+        (MAIN, *petals),
+        (ACCENT, ellipsoid(0.13, 0.20, 0.20).at(0.03, 0, 1.30)),
+        (
             "green",
             cylinder(0.04, 1.25).at(-0.03, 0, 0.66),
             ellipsoid(0.05, 0.30, 0.12).turned("x", 35).at(-0.03, 0.27, 0.52),
             ellipsoid(0.05, 0.30, 0.12).turned("x", -35).at(-0.03, -0.27, 0.40),
         ),
-        _painted("brown", ellipsoid(0.30, 0.30, 0.10).at(-0.03, 0, 0.05)),
+        ("brown", ellipsoid(0.30, 0.30, 0.10).at(-0.03, 0, 0.05)),
     )
 
 
 def _windmill() -> Thing:
     blades = [
-        _painted(colour, blade.turned("x", 45.0 + 90.0 * i).at(0, 0, 1.30))
+        (colour, blade.turned("x", 45.0 + 90.0 * i).at(0, 0, 1.30))
         for i in range(4)
         for colour, blade in (
             ("brown", box(0.04, 0.05, 0.95).at(0.47, 0, 0.48)),
@@ -539,12 +540,10 @@ def _windmill() -> Thing:
         "cream",
         "red",
         1.7,
-        _painted(MAIN, frustum(0.46, 0.30, 1.25).at(z=0.62)),
-        _painted("brown", cone(0.38, 0.42).at(z=1.46), box(0.10, 0.20, 0.36).at(0.42, 0, 0.20)),
-        _painted(
-            "charcoal", cylinder(0.06, 0.34).turned("y", 90).at(0.36, 0, 1.30), ball(0.08).at(0.52, 0, 1.30)
-        ),
-        _painted("navy", box(0.08, 0.14, 0.16).at(0.36, 0, 0.78), *windows),
+        (MAIN, frustum(0.46, 0.30, 1.25).at(z=0.62)),
+        ("brown", cone(0.38, 0.42).at(z=1.46), box(0.10, 0.20, 0.36).at(0.42, 0, 0.20)),
+        ("charcoal", cylinder(0.06, 0.34).turned("y", 90).at(0.36, 0, 1.30), ball(0.08).at(0.52, 0, 1.30)),
+        ("navy", box(0.08, 0.14, 0.16).at(0.36, 0, 0.78), *windows),
         *blades,
     )
 
@@ -558,12 +557,12 @@ def _cake() -> Thing:
         "pink",
         "red",
         0.8,
-        _painted("silver", cylinder(0.78, 0.05).at(z=0.025)),
-        _painted(MAIN, cylinder(0.60, 0.46).at(z=0.28), cylinder(0.34, 0.34).at(z=0.67)),
-        _painted("white", *(torus(ring, pipe).at(z=z) for ring, pipe, z in icing)),
-        _painted(ACCENT, *cherries),
-        _painted("cyan", *candles),
-        _painted("yellow", *flames),
+        ("silver", cylinder(0.78, 0.05).at(z=0.025)),
+        (MAIN, cylinder(0.60, 0.46).at(z=0.28), cylinder(0.34, 0.34).at(z=0.67)),
+        ("white", *(torus(ring, pipe).at(z=z) for ring, pipe, z in icing)),
+        (ACCENT, *cherries),
+        ("cyan", *candles),
+        ("yellow", *flames),
     )
 
 
@@ -573,10 +572,10 @@ def _icecream() -> Thing:
         "pink",
         "cream",
         0.7,
-        (Part(waffle, Coat("beige", "brown", "checkered")),),
-        _painted(MAIN, ball(0.38).at(z=1.22), torus(0.35, 0.07).at(z=1.10)),
-        _painted(ACCENT, ball(0.29).at(z=1.68)),
-        _painted("red", ball(0.09).at(z=2.00)),
+        (Coat("beige", "brown", "checkered"), waffle),
+        (MAIN, ball(0.38).at(z=1.22), torus(0.35, 0.07).at(z=1.10)),
+        (ACCENT, ball(0.29).at(z=1.68)),
+        ("red", ball(0.09).at(z=2.00)),
     )
 
 
@@ -585,7 +584,7 @@ def _candle() -> Thing:
         "cream",
         "gold",
         0.5,
-        _painted(
+        (
             MAIN,
             cylinder(0.26, 1.00).at(z=0.62),
             capsule(0.06, 0.36).at(0.24, 0.06, 0.98),
@@ -593,9 +592,9 @@ def _candle() -> Thing:
             capsule(0.05, 0.30).at(0.02, -0.255, 1.00),
             torus(0.235, 0.04).at(z=1.12),
         ),
-        _painted("black", cylinder(0.02, 0.16).at(z=1.18)),
-        _painted("orange", ellipsoid(0.10, 0.10, 0.16).at(z=1.36), cone(0.082, 0.22).at(z=1.52)),
-        _painted(
+        ("black", cylinder(0.02, 0.16).at(z=1.18)),
+        ("orange", ellipsoid(0.10, 0.10, 0.16).at(z=1.36), cone(0.082, 0.22).at(z=1.52)),
+        (
             ACCENT,
             frustum(0.40, 0.54, 0.12).at(z=0.08),
             torus(0.50, 0.04).at(z=0.14),
@@ -609,9 +608,9 @@ def _planet() -> Thing:
         "orange",
         "cream",
         1.2,
-        (Part(ball(0.55), Coat(MAIN, ACCENT, "striped")),),
-        _painted("beige", tube(0.92, 0.70, 0.03).turned("x", 22)),
-        _painted("brown", tube(1.05, 0.96, 0.03).turned("x", 22)),
+        (Coat(MAIN, ACCENT, "striped"), ball(0.55)),
+        ("beige", tube(0.92, 0.70, 0.03).turned("x", 22)),
+        ("brown", tube(1.05, 0.96, 0.03).turned("x", 22)),
     )
 
 
@@ -621,9 +620,9 @@ def _donut() -> Thing:
     for i in range(20):
         turn, tilt = 18.0 * i, (-34.0, 8.0, 38.0)[i % 3]
         seed = capsule(0.028, 0.13).turned("y", 90).turned("z", 47.0 * i).at(z=0.335).turned("y", tilt)
-        sprinkles.append(_painted(colours[i % 5], seed.at(0.62).turned("z", turn).at(z=0.05)))
+        sprinkles.append((colours[i % 5], seed.at(0.62).turned("z", turn).at(z=0.05)))
     dough, icing = torus(0.62, 0.33), torus(0.62, 0.325).at(z=0.05)
-    return _thing("pink", "white", 0.6, _painted("beige", dough), _painted(MAIN, icing), *sprinkles)
+    return _thing("pink", "white", 0.6, ("beige", dough), (MAIN, icing), *sprinkles)
 
 
 PRIMITIVES: dict[str, Solid] = {
