@@ -1,11 +1,12 @@
 """MVDream as its authors published it: the tensor names of latent diffusion, read into classes of diffusers.
 
-The published file contains tensors but no configuration. The configuration equals Stable Diffusion 2.1's
-with an input for cameras, and it is written down here.
+The published file contains tensors but neither configuration nor noise schedule. Both equal Stable Diffusion
+2.1's, with an input for cameras, and are written down here.
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cadam3d.core.checks import fail, require
+from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
 from cadam3d.io.pretrained import (
     LIBRARIES,
@@ -26,12 +27,14 @@ from cadam3d.io.pretrained import (
     short,
 )
 
-# For each part its class, and the prefix of its tensors' names in a file with a whole model.
+# The class of each part.
 PARTS = {
-    "unet": (("diffusers", "UNet2DConditionModel"), "model.diffusion_model."),
-    "vae": (("diffusers", "AutoencoderKL"), "first_stage_model."),
-    "text_encoder": (("transformers", "CLIPTextModel"), "cond_stage_model.model."),
+    "unet": ("diffusers", "UNet2DConditionModel"),
+    "vae": ("diffusers", "AutoencoderKL"),
+    "text_encoder": ("transformers", "CLIPTextModel"),
 }
+# The beginning of the names of the UNet's tensors in a file with a whole model.
+UNET = "model.diffusion_model."
 CONFIGURATIONS: dict[str, dict[str, Any]] = {
     "unet": {
         "block_out_channels": [320, 640, 1280, 1280],
@@ -60,6 +63,13 @@ CONFIGURATIONS: dict[str, dict[str, Any]] = {
         "bos_token_id": 49406,
         "eos_token_id": 49407,
     },
+    "scheduler": {
+        "beta_schedule": "scaled_linear",
+        "beta_start": 0.00085,
+        "beta_end": 0.012,
+        "num_train_timesteps": 1000,
+        "prediction_type": "epsilon",
+    },
 }
 
 
@@ -67,7 +77,7 @@ CONFIGURATIONS: dict[str, dict[str, Any]] = {
 class LatentDiffusion(Pretrained):
     """A model in which some parts have latent diffusion's names, and the others have diffusers' names."""
 
-    # For each such part, the file of its tensors and the prefix of their names.
+    # For each such part, the file of its tensors, and what their names lack at the beginning.
     files: Mapping[str, tuple[Path, str]]
 
     def part(self, name: str, dtype: torch.dtype | None = None) -> Any:
@@ -76,52 +86,42 @@ class LatentDiffusion(Pretrained):
             return super().part(name, dtype)
         from accelerate import init_empty_weights
 
-        kind, tensors = self._kind(name), self._tensors(name)
         with init_empty_weights(include_buffers=False):
-            network = empty(kind, self.config(name))
+            network = empty(self._kind(name), self.config(name))
+        file, lacking = self.files[name]
+        tensors = read_tensors(f"{self.source.key}.path", file)
+        # Older versions of transformers put the text encoder into another module.
+        names = {own.removeprefix("text_model."): own for own in network.state_dict()}
         try:
-            converted = CONVERSIONS[name](tensors, network)
-            cast = {k: tensor if dtype is None else tensor.to(dtype) for k, tensor in converted.items()}
-            network.load_state_dict(cast, assign=True)
+            converted = _convert(name, {lacking + k: tensor for k, tensor in tensors.items()}, network)
+            found = {k.removeprefix("text_model."): tensor.to(dtype) for k, tensor in converted.items()}
+            # The file has one more layer of the text encoder, which the model does not use.
+            loaded = {names[k]: tensor for k, tensor in found.items() if k in names}
+            network.load_state_dict(loaded, assign=True)
         except (KeyError, RuntimeError, ValueError) as error:
-            raise UserError(
-                f"{self.source.key}: {self.files[name][0]} contains no {name} of MVDream ({short(error)}). "
-                f"Try: another {self.source.key}.path"
-            ) from error
+            problem = f"{self.source.key}: {file} contains no {name} of MVDream ({short(error)})"
+            raise UserError(f"{problem}. Try: another {self.source.key}.path") from error
         return network.requires_grad_(False).eval()
 
     def config(self, name: str) -> dict[str, Any]:
         """Return the configuration of one part."""
         return CONFIGURATIONS[name] if name in self.files else super().config(name)
 
-    def _tensors(self, name: str) -> dict[str, Tensor]:
-        file, prefix = self.files[name]
-        tensors = read_tensors(f"{self.source.key}.path", file)
-        return {k.removeprefix(prefix): tensor for k, tensor in tensors.items() if k.startswith(prefix)}
-
 
 @dataclass(frozen=True)
 class SingleFile(LatentDiffusion):
-    """A whole model in one file. The file has neither a tokenizer nor a noise schedule; both are given."""
+    """A whole model in one file, which has no tokenizer."""
 
-    scheduler: Mapping[str, Any]  # configuration of the noise schedule
     tokenizer: str  # folder or name on the hub, with CLIP's vocabulary
 
     @staticmethod
-    def open(source: ModelSource, scheduler: Mapping[str, Any], tokenizer: str) -> "SingleFile":
+    def open(source: ModelSource, tokenizer: str) -> "SingleFile":
         """Return the model in ``source.path``. Its tensors are read when a part is loaded."""
         require_extra(source.key)
         file = Path(str(source.path)).expanduser()
-        return SingleFile(
-            source=source,
-            where=str(file),
-            revision=None,
-            file=file,
-            index={name: list(kind) for name, (kind, _) in PARTS.items()},
-            files={name: (file, prefix) for name, (_, prefix) in PARTS.items()},
-            scheduler=scheduler,
-            tokenizer=tokenizer,
-        )
+        index = {name: list(kind) for name, kind in PARTS.items()}
+        files = dict.fromkeys(PARTS, (file, ""))
+        return SingleFile(source, str(file), None, file, index, files, tokenizer)
 
     def part(self, name: str, dtype: torch.dtype | None = None) -> Any:
         """Load one part; see :meth:`Pretrained.part`. The tokenizer pads with zeros, as OpenCLIP does."""
@@ -129,7 +129,7 @@ class SingleFile(LatentDiffusion):
 
     def config(self, name: str) -> dict[str, Any]:
         """Return the configuration of one part; see :meth:`Pretrained.config`."""
-        return dict(self.scheduler) if name == "scheduler" else super().config(name)
+        return CONFIGURATIONS[name]
 
     @property
     def identity(self) -> str:
@@ -140,17 +140,18 @@ class SingleFile(LatentDiffusion):
     def _load_tokenizer(self) -> Any:
         from transformers import CLIPTokenizer
 
-        config, key = self.config("text_encoder"), f"{self.source.key}.tokenizer"
-        expected = f"a folder or name on the hub with the {config['vocab_size']} pieces of CLIP's vocabulary"
-        try:
-            loaded = CLIPTokenizer.from_pretrained(
-                self.tokenizer, model_max_length=config["max_position_embeddings"]
-            )
-        except (OSError, ValueError) as error:
-            raise fail(key, expected=expected, got=self.tokenizer, example=f"{key}=DIR") from error
-        # If the files are missing, transformers silently makes a tokenizer that knows no word.
-        fits = len(loaded) == config["vocab_size"]
-        require(fits, key, expected=expected, got=self.tokenizer, example=f"{key}=DIR")
+        config, key, loaded = self.config("text_encoder"), f"{self.source.key}.tokenizer", None
+        length, pieces = config["max_position_embeddings"], config["vocab_size"]
+        with suppress(OSError, ValueError):
+            loaded = CLIPTokenizer.from_pretrained(self.tokenizer, model_max_length=length)
+        # If the files are missing, transformers may silently make a tokenizer that knows no word.
+        require(
+            loaded is not None and len(loaded) == pieces,
+            key,
+            expected=f"a folder or name on the hub with the {pieces} pieces of CLIP's vocabulary",
+            got=self.tokenizer,
+            example=f"{key}=DIR",
+        )
         loaded.pad_token_id = 0
         return loaded
 
@@ -160,15 +161,15 @@ def with_ldm_unet(found: Pretrained) -> Pretrained:
     library = str((found.index.get("unet") or [None])[0])
     if library in LIBRARIES:
         return found
-    index = found.index | {"unet": list(PARTS["unet"][0])}
-    file = _weights_file(found, "unet")
-    return LatentDiffusion(found.source, found.where, found.revision, found.file, index, {"unet": (file, "")})
+    index = found.index | {"unet": list(PARTS["unet"])}
+    files = {"unet": (_unet_file(found), UNET)}
+    return LatentDiffusion(found.source, found.where, found.revision, found.file, index, files)
 
 
-def _weights_file(found: Pretrained, part: str) -> Path:
-    """Return the file with the tensors of one part of a model in the layout of diffusers."""
+def _unet_file(found: Pretrained) -> Path:
+    """Return the file with the tensors of the UNet of a model in the layout of diffusers."""
     variant = f".{found.source.variant}" if found.source.variant else ""
-    stem = f"{part}/diffusion_pytorch_model{variant}"
+    stem = f"unet/diffusion_pytorch_model{variant}"
     reason = "no such file"
     for name in (f"{stem}.safetensors", f"{stem}.bin"):
         file = Path(found.where) / name
@@ -182,37 +183,13 @@ def _weights_file(found: Pretrained, part: str) -> Path:
     )
 
 
-# --- names in diffusers -------------------------------------------------------------------------------------
+def _convert(name: str, tensors: Mapping[str, Tensor], network: Any) -> dict[str, Tensor]:
+    """Return the tensors of one part under their names in diffusers or transformers."""
+    from diffusers.loaders import single_file_utils as names
 
-
-def _convert_unet(tensors: Mapping[str, Tensor], network: Any) -> dict[str, Tensor]:
-    from diffusers.loaders.single_file_utils import convert_ldm_unet_checkpoint
-
-    prefix = PARTS["unet"][1]
-    named = {prefix + k.replace("camera_embed.", "label_emb.0."): tensor for k, tensor in tensors.items()}
-    return convert_ldm_unet_checkpoint(named, network.config)
-
-
-def _convert_vae(tensors: Mapping[str, Tensor], network: Any) -> dict[str, Tensor]:
-    from diffusers.loaders.single_file_utils import convert_ldm_vae_checkpoint
-
-    prefix = PARTS["vae"][1]
-    return convert_ldm_vae_checkpoint({prefix + k: tensor for k, tensor in tensors.items()}, network.config)
-
-
-def _convert_text_encoder(tensors: Mapping[str, Tensor], network: Any) -> dict[str, Tensor]:
-    from diffusers.loaders.single_file_utils import convert_open_clip_checkpoint
-
-    unused = f"transformer.resblocks.{network.config.num_hidden_layers}."
-    ignored = (unused, "text_projection")
-    wanted = {name: tensor for name, tensor in tensors.items() if not name.startswith(ignored)}
-    converted = convert_open_clip_checkpoint(network, wanted, prefix="")
-    is_wrapped = hasattr(network, "text_model")  # in older versions of transformers
-    return converted if is_wrapped else {k.removeprefix("text_model."): t for k, t in converted.items()}
-
-
-CONVERSIONS: dict[str, Callable[[Mapping[str, Tensor], Any], dict[str, Tensor]]] = {
-    "unet": _convert_unet,
-    "vae": _convert_vae,
-    "text_encoder": _convert_text_encoder,
-}
+    if name == "unet":
+        named = {k.replace("camera_embed.", "label_emb.0."): tensor for k, tensor in tensors.items()}
+        return names.convert_ldm_unet_checkpoint(named, network.config)
+    if name == "vae":
+        return names.convert_ldm_vae_checkpoint(tensors, network.config)
+    return names.convert_open_clip_checkpoint(network, tensors)

@@ -28,14 +28,6 @@ CHECKED = 100
 CAMERA = 16
 # Largest deviation from a quarter turn between the views of a group, and of their elevations.
 TOLERANCE_DEG = 1.0
-# The noise schedule of the published files, which do not contain it.
-SCHEDULER = {
-    "beta_schedule": "scaled_linear",
-    "beta_start": 0.00085,
-    "beta_end": 0.012,
-    "num_train_timesteps": 1000,
-    "prediction_type": "epsilon",
-}
 
 
 @dataclass(frozen=True)
@@ -79,7 +71,7 @@ class MVDream(StableDiffusion):
         Raises ``UserError`` if its network does not read cameras.
         """
         if isinstance(self.path, str) and Path(self.path).expanduser().is_file():
-            found = SingleFile.open(self.source, SCHEDULER, self.tokenizer)
+            found = SingleFile.open(self.source, self.tokenizer)
         else:
             found = with_ldm_unet(self.source.find(self.kinds, PRIORS))
         if found.config("unet").get("projection_class_embeddings_input_dim") != CAMERA:

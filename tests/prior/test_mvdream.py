@@ -61,7 +61,7 @@ def small(pipe, monkeypatch):
         name: dict(part.config.to_dict() if name == "text_encoder" else part.config)
         for name, part in parts.items()
     }
-    monkeypatch.setattr(ldm, "CONFIGURATIONS", configurations)
+    monkeypatch.setattr(ldm, "CONFIGURATIONS", ldm.CONFIGURATIONS | configurations)
 
 
 def views(count=4, size=64):
