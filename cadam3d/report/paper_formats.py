@@ -4,17 +4,15 @@ import csv
 import io
 import re
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 
 from cadam3d.io.atomic import replacing
 from cadam3d.io.run_folder import PAPER_TABLE_CSV, PAPER_TABLE_LATEX, PAPER_TABLE_MARKDOWN
-from cadam3d.report.paper_table import PaperTable, TableCell, TableRow, paper_table
+from cadam3d.report.paper_table import FIRST, PaperTable, paper_table
 from cadam3d.report.results import read
 from cadam3d.sweep.folder import read_plan
 
-FIRST = ("category", "objective", "method", "source", "prompts")
-ALL = "all prompts"
-ARROWS = {True: "↑", False: "↓", None: ""}
 # Characters with a meaning in LaTeX, or that its fonts lack.
 LATEX = {
     "\\": r"\textbackslash{}",
@@ -31,31 +29,10 @@ LATEX = {
 }
 
 
-def headings(table: PaperTable) -> list[str]:
-    """Return the titles of all columns, with an arrow towards the better numbers."""
-    return [*FIRST, *(f"{each.heading} {ARROWS[each.is_more_better]}".strip() for each in table.numbers)]
-
-
-def texts(table: PaperTable) -> list[list[str]]:
-    """Return the text of every cell of every row, for readers."""
-    return [[*_beginning(row), *(text(cell, row) for cell in row.cells)] for row in table.rows]
-
-
-def _beginning(row: TableRow) -> tuple[str, ...]:
-    return row.category or ALL, row.objective, row.method, row.source, row.prompts
-
-
-def text(cell: TableCell, row: TableRow) -> str:
-    """Return the text of a number with its interval, and how many prompts it has if other than its row."""
-    interval = f" ± {cell.half}" if cell.half else ""
-    is_other = cell.prompts is not None and str(cell.prompts) != row.prompts.partition(" ")[0]
-    return f"{cell.text}{interval}{f' ({cell.prompts})' if is_other else ''}"
-
-
 def markdown(table: PaperTable) -> str:
     """Return the table as Markdown, with its notes as a list."""
     rule = [*["---"] * len(FIRST), *["---:"] * len(table.numbers)]
-    rows = [_markdown_line(headings(table)), f"| {' | '.join(rule)} |", *map(_markdown_line, texts(table))]
+    rows = [_markdown_line(table.titles), f"| {' | '.join(rule)} |", *map(_markdown_line, table.lines)]
     return "\n".join([*rows, "", *(f"- {note}" for note in table.notes)]) + "\n"
 
 
@@ -65,33 +42,19 @@ def _markdown_line(cells: Sequence[str]) -> str:
 
 
 def comma_separated(table: PaperTable) -> str:
-    """Return the table as CSV: each number with half the width of its interval and its count of prompts."""
+    """Return the table as CSV."""
     file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    titles = [number.heading for number in table.numbers]
-    writer.writerow(
-        [*FIRST, *(each for title in titles for each in (title, f"{title}: ±", f"{title}: prompts"))]
-    )
-    for row in table.rows:
-        numbers = [
-            entry
-            for cell in row.cells
-            for entry in (cell.text.replace(",", ""), cell.half.replace(",", ""), cell.prompts)
-        ]
-        writer.writerow([*_beginning(row), *numbers])
+    csv.writer(file, lineterminator="\n").writerows([table.titles, *table.lines])
     return file.getvalue()
 
 
 def latex(table: PaperTable) -> str:
     """Return the table as LaTeX that needs no package, with a line above each objective."""
-    lines = [r"\begin{table}", r"\centering"]
-    lines += [rf"\begin{{tabular}}{{{'l' * len(FIRST)}{'r' * len(table.numbers)}}}", r"\hline"]
-    lines += [_latex_line(headings(table))]
-    before = None
-    for row, cells in zip(table.rows, texts(table), strict=True):
-        lines += [r"\hline"] if before != (row.category, row.objective) else []
-        before = (row.category, row.objective)
-        lines.append(_latex_line(cells))
+    columns = "l" * len(FIRST) + "r" * len(table.numbers)
+    lines = [r"\begin{table}", r"\centering", rf"\begin{{tabular}}{{{columns}}}", r"\hline"]
+    lines.append(_latex_line(table.titles))
+    for _, rows in groupby(table.lines, key=lambda row: row[:2]):
+        lines += [r"\hline", *map(_latex_line, rows)]
     notes = [f"% {note}" for note in table.notes]
     return "\n".join([*lines, r"\hline", r"\end{tabular}", r"\end{table}", *notes]) + "\n"
 

@@ -6,45 +6,36 @@ table.
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from cadam3d.core.number import Number
 from cadam3d.report.compare import Mean, change, main_setting, mean, references
 from cadam3d.report.published import ROWS, SCORES, SIZES
 from cadam3d.report.results import GUIDANCE, PROMPT, RECIPE, SEED, Cell, JobResult, arms_of, measured
 
-MINE, PUBLISHED = "this sweep", "published"
+FIRST = ("category", "objective", "method", "source", "prompts")
+ALL, MINE, PUBLISHED = "all prompts", "this sweep", "published"
 MISSING = "-"
-
-
-@dataclass(frozen=True)
-class TableCell:
-    """A number of the table as text."""
-
-    text: str = MISSING
-    half: str = ""  # half the width of its 95 % interval; empty if there is none
-    prompts: int | None = None  # how many prompts it was measured on; None for a published number
-
-
-@dataclass(frozen=True)
-class TableRow:
-    """A row of the table."""
-
-    objective: str
-    method: str
-    source: str  # MINE or PUBLISHED
-    prompts: str  # how many have a result, such as "49 of 50"; empty for a published row
-    cells: list[TableCell]  # one for each number of the table
-    category: str = ""  # of its prompts; empty: all prompts
+ARROWS = {True: "↑", False: "↓", None: ""}
 
 
 @dataclass(frozen=True)
 class PaperTable:
     """The paper's table 1 of a sweep: the rows of all prompts, and then of each category."""
 
-    numbers: list[Number]  # one for each column
-    rows: list[TableRow]
+    numbers: list[Number]  # one for each column after FIRST
+    lines: list[list[str]]  # a text for each column
     notes: list[str]  # sentences below it
+
+    @property
+    def titles(self) -> list[str]:
+        """Return the titles of all columns, with an arrow towards the better numbers."""
+        return [*FIRST, *(f"{each.heading} {ARROWS[each.is_more_better]}".strip() for each in self.numbers)]
+
+    @property
+    def is_text(self) -> list[bool]:
+        """Return which columns are text, which a page aligns to the left."""
+        return [True] * len(FIRST) + [False] * len(self.numbers)
 
 
 def paper_table(results: Sequence[JobResult]) -> PaperTable | None:
@@ -54,21 +45,17 @@ def paper_table(results: Sequence[JobResult]) -> PaperTable | None:
         return None
     known = columns(usable)
     numbers = comparable(known, usable)
-    rows = _rows(results, numbers)
-    rows += (published := _published(rows, numbers))
+    rows = _rows(results, numbers, ALL)
+    published = _published(rows, numbers)
+    rows += published
     for category in filter(None, dict.fromkeys(result.category for result in results)):
-        own = _rows([result for result in results if result.category == category], numbers)
-        rows += [replace(row, category=category) for row in own]
+        own = [result for result in results if result.category == category]
+        rows += _rows(own, numbers, category)
     notes = _notes(usable, numbers)
     if published:
-        notes.append(
-            "Rows marked published are printed in the paper's table 1. They belong to another protocol. "
-            "Compare their differences with ours, and not the numbers themselves."
-        )
+        notes.append("Rows marked published are printed in the paper's table 1, by another protocol.")
     if left_out := [number.name for number in known if number not in numbers]:
-        notes.append(
-            f"Not in the table, because the jobs measured them in different ways: {', '.join(left_out)}."
-        )
+        notes.append(f"Left out, because jobs measured them in different ways: {', '.join(left_out)}.")
     return PaperTable(numbers, rows, notes)
 
 
@@ -132,63 +119,65 @@ def _label(axes: Iterable[tuple[str, str]], jobs: Iterable[JobResult]) -> str:
     return ", ".join([*families, *others]) or MISSING
 
 
-def _rows(results: Sequence[JobResult], numbers: Sequence[Number]) -> list[TableRow]:
-    rows: list[TableRow] = []
+def _rows(results: Sequence[JobResult], numbers: Sequence[Number], category: str) -> list[list[str]]:
+    """Return a row per objective and setting, and the differences between the arms of each objective."""
+    rows = []
     for objective, jobs in _groups(results):
         for setting in dict.fromkeys(job.setting for job in jobs):
             own = [job for job in jobs if job.setting == setting]
-            cells = [_cell(mean(_by_prompt(_values(own, each))), each.digits) for each in numbers]
             prompts = _prompts((job.cell for job in measured(own)), own)
-            rows.append(TableRow(objective, setting.name, MINE, prompts, cells))
-        rows += _difference_rows(objective, jobs, numbers)
+            means = [mean(_by_prompt(_values(own, each))) for each in numbers]
+            cells = [_text(each, number.digits, prompts) for each, number in zip(means, numbers, strict=True)]
+            rows.append([category, objective, setting.name, MINE, prompts, *cells])
+        rows += [[category, objective, *row] for row in _differences(jobs, numbers)]
     return rows
 
 
-def _difference_rows(
-    objective: str, jobs: Sequence[JobResult], numbers: Sequence[Number]
-) -> Iterator[TableRow]:
+def _differences(jobs: Sequence[JobResult], numbers: Sequence[Number]) -> Iterator[list[str]]:
     """Yield a row for each other arm: its differences from the baseline, over what both have."""
     for baseline in references(jobs)[:1]:
         for arm in (arm for arm in arms_of(jobs) if arm != baseline):
             settings = main_setting(jobs, arm), main_setting(jobs, baseline)
             ours, theirs = ([job for job in jobs if job.setting == each] for each in settings)
-            cells = [_difference(ours, theirs, number) for number in numbers]
             both = {job.cell for job in measured(ours)} & {job.cell for job in measured(theirs)}
             prompts = _prompts(both, [*ours, *theirs])
-            yield TableRow(objective, f"{arm} - {baseline}", MINE, prompts, cells)
+            cells = [_difference(ours, theirs, number, prompts) for number in numbers]
+            yield [f"{arm} - {baseline}", MINE, prompts, *cells]
 
 
-def _difference(ours: Sequence[JobResult], theirs: Sequence[JobResult], number: Number) -> TableCell:
+def _difference(
+    ours: Sequence[JobResult], theirs: Sequence[JobResult], number: Number, prompts: str
+) -> str:
     """Return the difference of a number over the prompts and seeds in which both have it."""
     having = _values(ours, number), _values(theirs, number)
     shared = having[0].keys() & having[1].keys()
     first, second = (_by_prompt({cell: values[cell] for cell in shared}) for values in having)
     if number in SIZES:
-        return _cell(change(first, second), 1, "+", " %")
-    return _cell(mean({prompt: first[prompt] - second[prompt] for prompt in first}), number.digits, "+")
+        return _text(change(first, second), 1, prompts, "+", " %")
+    found = mean({prompt: first[prompt] - second[prompt] for prompt in first})
+    return _text(found, number.digits, prompts, "+")
 
 
-def _published(rows: Iterable[TableRow], numbers: Sequence[Number]) -> list[TableRow]:
+def _published(rows: Iterable[Sequence[str]], numbers: Sequence[Number]) -> list[list[str]]:
     """Return the published rows of the objectives in ``rows``."""
-    objectives = {row.objective.partition(",")[0] for row in rows}
+    objectives = {row[FIRST.index("objective")].partition(",")[0] for row in rows}
     return [
-        TableRow(
-            f"{row.objective}, {row.recipe}",
-            row.arm,
-            PUBLISHED,
-            "",
-            [TableCell(row.texts.get(number.name, MISSING)) for number in numbers],
-        )
+        [
+            *(ALL, f"{row.objective}, {row.recipe}", row.arm, PUBLISHED, ""),
+            *(row.texts.get(number.name, MISSING) for number in numbers),
+        ]
         for row in ROWS
         if row.objective in objectives
     ]
 
 
-def _cell(found: Mean | None, digits: int, sign: str = "", unit: str = "") -> TableCell:
+def _text(found: Mean | None, digits: int, prompts: str, sign: str = "", unit: str = "") -> str:
+    """Return a mean with half its interval, and its count of prompts if it is not its row's."""
     if found is None:
-        return TableCell()
-    half = "" if found.half is None else f"{found.half:,.{digits}f}"
-    return TableCell(f"{found.value:{sign},.{digits}f}{unit}", half, found.prompts)
+        return MISSING
+    interval = "" if found.half is None else f" ± {found.half:,.{digits}f}"
+    own = "" if str(found.prompts) == prompts.partition(" ")[0] else f" ({found.prompts})"
+    return f"{found.value:{sign},.{digits}f}{unit}{interval}{own}"
 
 
 def _values(jobs: Iterable[JobResult], number: Number) -> dict[Cell, float]:
@@ -210,10 +199,8 @@ def _prompts(found: Iterable[Cell], planned: Iterable[JobResult]) -> str:
 
 def _notes(usable: Sequence[JobResult], numbers: Sequence[Number]) -> list[str]:
     notes = [
-        "Means over prompts, of which each is a mean over its seeds; after ±, half the width of the 95 % "
-        "interval over prompts (Student's t).",
-        "Rows of differences compare the same prompts and seeds under both arms. Gaussians and sizes are "
-        "compared by their means, as in the paper: -90 % means that the mean is a tenth.",
+        "Means over prompts and, after ±, half the width of their 95 % interval (Student's t).",
+        "Differences compare the same prompts and seeds; Gaussians and sizes by the ratio of their means.",
     ]
     names = {number.name for number in numbers}
     methods = [score.method for job in usable for name, score in job.scores.items() if name in names]

@@ -14,11 +14,10 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.outcome import Outcome
 from cadam3d.io.jsonl import read_json
 from cadam3d.io.run_folder import CHOICE, FIGURES, REPORT, TABLE
-from cadam3d.report import figures, paper_formats, strips, tables
+from cadam3d.report import figures, strips, tables
 from cadam3d.report.formatting import plural
-from cadam3d.report.pages import Table, table, write_page
+from cadam3d.report.pages import table, write_page
 from cadam3d.report.paper_formats import FORMATS, read_table
-from cadam3d.report.paper_table import PaperTable
 from cadam3d.report.results import PROMPT, JobResult, measured, read
 from cadam3d.report.score_maps import declared_scores, score_figure
 from cadam3d.report.style import inline, styled, write_figure
@@ -98,7 +97,6 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None, baseline: str 
     kinds |= _frontiers(results)
     drawn = [(kinds[name], _drawn(results, name, kinds[name], folder)) for name in chosen if name in kinds]
     unknown = [name for name in chosen if name not in kinds]
-    paper = read_table(sweep_folder)
     return write_page(
         sweep_folder / REPORT,
         "sweep.html.jinja",
@@ -107,8 +105,7 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None, baseline: str 
         warnings=[f"figures: expected one of {', '.join(kinds)}, got {name}." for name in unknown],
         choice=_choice(sweep_folder),
         comparison=table(tables.shown_comparison(comparison, results), align_decimals=True),
-        paper_table=_shown(paper),
-        notes=paper.notes if paper else (),
+        paper=read_table(sweep_folder),
         medians=table(medians, align_decimals=True),
         figures=[(kind, svg) for kind, svg in drawn if svg],
         early=[each for each in results if each.outcome != Outcome.FINISHED and not each.is_unfinished],
@@ -125,15 +122,6 @@ def _choice(folder: Path) -> str:
         return str(read_json(folder / CHOICE)["why"])
     except (UserError, LookupError, TypeError):
         return ""
-
-
-def _shown(found: PaperTable | None) -> Table:
-    """Return the paper's table as a part of the page; it is empty if there is none."""
-    if found is None:
-        return Table([], [], [])
-    titles = paper_formats.headings(found)
-    is_text = [True] * len(paper_formats.FIRST) + [False] * len(found.numbers)
-    return Table(titles, is_text, paper_formats.texts(found))
 
 
 def _scores(results: Sequence[JobResult]) -> dict[str, FigureKind]:

@@ -14,8 +14,8 @@ from cadam3d import report
 from cadam3d.io import run_folder
 from cadam3d.report import paper_formats
 from cadam3d.report.compare import change, mean
-from cadam3d.report.paper_formats import comma_separated, headings, in_latex, latex, markdown, texts
-from cadam3d.report.paper_table import columns, paper_table
+from cadam3d.report.paper_formats import comma_separated, in_latex, latex, markdown
+from cadam3d.report.paper_table import ALL, FIRST, columns, paper_table
 from cadam3d.report.published import ROWS, SCORES, SIZES
 from cadam3d.report.results import read
 
@@ -62,19 +62,17 @@ def table_of(folder):
     return table
 
 
-def cell_of(table, row, name):
-    return row.cells[[number.name for number in table.numbers].index(name)]
+def cell_of(table, row, name) -> tuple[str, str]:
+    """Return a number of a row as text, and half the width of its interval."""
+    cell = row[len(FIRST) + [number.name for number in table.numbers].index(name)]
+    text, _, half = cell.partition(" ± ")
+    return text, half.replace(",", "")
 
 
-def row_of(table, objective, method, source="this sweep", category=""):
-    found = [
-        row
-        for row in table.rows
-        if row.category == category
-        and (row.objective.partition(",")[0], row.method, row.source) == (objective, method, source)
-    ]
-    assert len(found) == 1
-    return found[0]
+def row_of(table, objective, method, source="this sweep", category=ALL):
+    wanted = (category, objective, method, source)
+    [row] = [row for row in table.lines if (row[0], row[1].partition(",")[0], *row[2:4]) == wanted]
+    return row
 
 
 def test_the_published_numbers_are_those_of_the_source():
@@ -90,35 +88,34 @@ def test_the_published_numbers_are_those_of_the_source():
 def test_means_and_intervals_equal_those_computed_by_hand(three):
     table = table_of(three)
     baseline, cadam = row_of(table, "SDS", "baseline"), row_of(table, "SDS", "cadam")
-    assert cell_of(table, baseline, "num_gaussians").text == "2,000"
+    text, half = cell_of(table, baseline, "num_gaussians")
+    assert text == "2,000"
     # The standard deviation of 1000, 2000 and 3000 is 1000.
-    assert float(cell_of(table, baseline, "num_gaussians").half.replace(",", "")) == pytest.approx(
-        T2 * 1000 / math.sqrt(3), abs=1
-    )
-    assert cell_of(table, cadam, "num_gaussians").text == "200"
-    assert cell_of(table, baseline, "psnr").text == "22.00"
-    assert cell_of(table, cadam, "psnr").text == "21.80"
+    assert float(half) == pytest.approx(T2 * 1000 / math.sqrt(3), abs=1)
+    assert cell_of(table, cadam, "num_gaussians")[0] == "200"
+    assert cell_of(table, baseline, "psnr")[0] == "22.00"
+    assert cell_of(table, cadam, "psnr")[0] == "21.80"
 
 
 def test_differences_are_paired_by_prompt(three):
     table = table_of(three)
     row = row_of(table, "SDS", "cadam - baseline")
     # PSNR differs by -0.1, -0.3 and -0.2 dB, with a standard deviation of 0.1 dB.
-    assert cell_of(table, row, "psnr").text == "-0.20"
-    assert float(cell_of(table, row, "psnr").half) == pytest.approx(T2 * 0.1 / math.sqrt(3), abs=0.006)
+    text, half = cell_of(table, row, "psnr")
+    assert text == "-0.20"
+    assert float(half) == pytest.approx(T2 * 0.1 / math.sqrt(3), abs=0.006)
     # 600 of 6,000 Gaussians remain. The residuals 100 - 100, 300 - 200 and 200 - 300 have a deviation of 100.
-    assert cell_of(table, row, "num_gaussians").text == "-90.0 %"
-    half = 100 * T2 * 100 / math.sqrt(3) / 2000
-    assert float(cell_of(table, row, "num_gaussians").half) == pytest.approx(half, abs=0.06)
+    text, half = cell_of(table, row, "num_gaussians")
+    assert text == "-90.0 %"
+    assert float(half) == pytest.approx(100 * T2 * 100 / math.sqrt(3) / 2000, abs=0.06)
 
 
 def test_missing_jobs_are_counted_and_left_out_of_pairs(three):
     table = table_of(three)
-    assert row_of(table, "VFDS", "baseline").prompts == "2 of 3"
-    assert row_of(table, "VFDS", "cadam").prompts == "3"
-    difference_row = row_of(table, "VFDS", "cadam - baseline")
-    assert difference_row.prompts == "2 of 3"
-    assert cell_of(table, difference_row, "num_gaussians").text == "-86.7 %"
+    difference = row_of(table, "VFDS", "cadam - baseline")
+    assert [row_of(table, "VFDS", arm)[4] for arm in ("baseline", "cadam")] == ["2 of 3", "3"]
+    assert difference[4] == "2 of 3"
+    assert cell_of(table, difference, "num_gaussians")[0] == "-86.7 %"
 
 
 def test_differences_of_a_number_use_the_seeds_in_which_both_have_it(jobs):
@@ -129,7 +126,7 @@ def test_differences_of_a_number_use_the_seeds_in_which_both_have_it(jobs):
         jobs.add("cadam", *where, n=50, psnr=20, arm="cadam", **({} if ours is None else scored(ours)))
     table = table_of(jobs.folder)
     row = row_of(table, "SDS", "cadam - baseline")
-    assert cell_of(table, row, "clip_score").text == "+1.00"
+    assert cell_of(table, row, "clip_score")[0] == "+1.00"
 
 
 def test_a_truth_that_eval_compares_with_does_not_replace_that_of_training(three):
@@ -147,53 +144,35 @@ def test_seeds_are_averaged_within_a_prompt_first(jobs):
     for prompt, seeds in (("a cube", (10, 20, 60)), ("a torus", (90,))):
         for seed, psnr in enumerate(seeds):
             jobs.add("cadam", f"prompt={prompt}", f"seed={seed}", n=100, psnr=psnr, arm="cadam")
-    assert (
-        cell_of(table_of(jobs.folder), row_of(table_of(jobs.folder), "SDS", "cadam"), "psnr").text == "60.00"
-    )
+    table = table_of(jobs.folder)
+    assert cell_of(table, row_of(table, "SDS", "cadam"), "psnr")[0] == "60.00"
 
 
 def test_published_rows_keep_their_text_and_never_share_a_cell(three):
     table = table_of(three)
     published = row_of(table, "VFDS", "cadam", "published")
-    assert cell_of(table, published, "num_gaussians").text == "82K"
-    assert cell_of(table, published, "asset_mib").text == "5.3MB"
-    assert cell_of(table, published, "psnr").text == "-"
-    assert not any(row.source == "published" for row in table.rows if row.category)
+    shown = [cell_of(table, published, name)[0] for name in ("num_gaussians", "asset_mib", "psnr")]
+    assert shown == ["82K", "5.3MB", "-"]
+    assert not any(row[3] == "published" for row in table.lines if row[0] != ALL)
     assert any("another protocol" in note for note in table.notes)
 
 
 def test_each_category_has_its_own_part(three):
     table = table_of(three)
-    assert list(dict.fromkeys(row.category for row in table.rows)) == ["", "Material", "Structure & 100 %"]
-    assert (
-        cell_of(table, row_of(table, "SDS", "baseline", category="Material"), "num_gaussians").text == "1,000"
-    )
-    assert cell_of(table, row_of(table, "SDS", "baseline", category="Material"), "num_gaussians").half == ""
-    assert row_of(table, "SDS", "baseline", category="Structure & 100 %").prompts == "2"
+    assert list(dict.fromkeys(row[0] for row in table.lines)) == [ALL, "Material", "Structure & 100 %"]
+    material = row_of(table, "SDS", "baseline", category="Material")
+    assert cell_of(table, material, "num_gaussians") == ("1,000", "")
+    assert row_of(table, "SDS", "baseline", category="Structure & 100 %")[4] == "2"
 
 
 def test_all_formats_show_the_same_cells(three):
     table = table_of(three)
-    wanted = texts(table)
-
     lines = [line for line in markdown(table).splitlines() if line.startswith("| ")]
     shown = [[cell.replace("\\", "") for cell in re.split(r" (?<!\\)\| ", line[2:-2])] for line in lines]
-    body = [line for line in shown if line != headings(table) and not line[0].startswith("---")]
-    assert body == wanted
-
-    rows = list(csv.reader(io.StringIO(comma_separated(table))))
-    assert [row[:5] for row in rows[1:]] == [line[:5] for line in wanted]
-    for row, line in zip(rows[1:], wanted, strict=True):
-        for i, cell in enumerate(line[5:]):
-            number, half, prompts = row[5 + 3 * i : 8 + 3 * i]
-            interval = f" ± {half}" if half else ""
-            own = f" ({prompts})" if prompts and prompts != line[4].partition(" ")[0] else ""
-            assert cell.replace(",", "") == f"{number}{interval}{own}"
-
+    assert [shown[0], *shown[2:]] == [table.titles, *table.lines]
+    assert list(csv.reader(io.StringIO(comma_separated(table)))) == [table.titles, *table.lines]
     body = [line for line in latex(table).splitlines() if line.endswith(r"\\")]
-    assert len(body) == len(wanted) + 1
-    for line in wanted:
-        assert " & ".join(map(in_latex, line)) + r" \\" in body
+    assert body == [" & ".join(map(in_latex, line)) + r" \\" for line in (table.titles, *table.lines)]
 
 
 def test_the_latex_is_balanced_and_escapes_what_users_type(three):
@@ -221,7 +200,7 @@ def test_the_page_of_the_sweep_shows_the_table_with_escaped_text(three):
     (three / run_folder.JOBS).write_text(json.dumps({**plan, "figures": ["no such"]}))
     page = report.write_sweep(three).read_text(encoding="utf-8")
     assert "&lt;b&gt;</td>" in page
-    for row in texts(table_of(three)):
+    for row in table_of(three).lines:
         assert all(html.escape(cell) in page for cell in row)
 
 
@@ -236,7 +215,7 @@ def test_columns_are_the_numbers_that_every_row_has(jobs):
         "num_gaussians",
         "asset_mib",
     ]
-    assert all(heading in headings(table_of(jobs.folder)) for heading in ("CLIP score ↑", "Gaussians ↓"))
+    assert all(heading in table_of(jobs.folder).titles for heading in ("CLIP score ↑", "Gaussians ↓"))
     for number in (*SCORES, *SIZES):
         declared_number = all_numbers()[number.name]
         assert (number.heading, number.digits) == (declared_number.heading, declared_number.digits)
@@ -280,8 +259,8 @@ def test_scores_of_one_table_belong_to_one_protocol(jobs):
 def test_settings_that_come_with_prompts_do_not_split_the_rows(jobs):
     for prompt, negative in (("a cube", "blurry"), ("a torus", "ugly")):
         jobs.add("cadam", f"prompt={prompt}", f"negative_prompt={negative}", n=10, psnr=20, arm="cadam")
-    rows = [row for row in table_of(jobs.folder).rows if row.source == "this sweep"]
-    assert [(row.objective, row.prompts) for row in rows] == [("SDS", "2")]
+    rows = [row for row in table_of(jobs.folder).lines if row[3] == "this sweep"]
+    assert [(row[1], row[4]) for row in rows] == [("SDS", "2")]
 
 
 def test_eval_replaces_the_numbers_of_training(jobs):
@@ -290,14 +269,12 @@ def test_eval_replaces_the_numbers_of_training(jobs):
     evaluation = declared({"num_gaussians": 10, **scored(25.0, {"name": "t3bench"})})
     (folder / run_folder.EVALUATION).write_text(json.dumps(evaluation))
     table = table_of(jobs.folder)
-    assert cell_of(table, row_of(table, "SDS", "cadam"), "clip_score").text == "25.00"
+    assert cell_of(table, row_of(table, "SDS", "cadam"), "clip_score")[0] == "25.00"
     assert any("protocol=t3bench" in note for note in table.notes)
     # An evaluation of another asset does not count.
     (folder / run_folder.EVALUATION).write_text(json.dumps({**evaluation, "num_gaussians": 11}))
-    assert (
-        cell_of(table_of(jobs.folder), row_of(table_of(jobs.folder), "SDS", "cadam"), "clip_score").text
-        == "30.00"
-    )
+    table = table_of(jobs.folder)
+    assert cell_of(table, row_of(table, "SDS", "cadam"), "clip_score")[0] == "30.00"
 
 
 def test_a_sweep_has_a_table_only_if_its_grid_asks_for_it(jobs):
@@ -311,7 +288,7 @@ def test_recipes_are_objectives(jobs):
     recipes = {"gaussiandreamer": "sds_gaussiandreamer", "flowdreamer": "vfds_flowdreamer"}
     for recipe, objective in recipes.items():
         jobs.add("cadam", f"experiment={recipe}", n=10, psnr=20, arm="cadam", guidance=objective)
-    labels = [row.objective for row in table_of(jobs.folder).rows if row.source == "this sweep"]
+    labels = [row[1] for row in table_of(jobs.folder).lines if row[3] == "this sweep"]
     assert labels == ["SDS, gaussiandreamer", "VFDS, flowdreamer"]
 
 
