@@ -43,7 +43,7 @@ def run(
     select = cfg.get("select")
     sweep, numbers = read_attempts(cfg, overrides, options), selectable_numbers(options)
     existing = [attempt_of(row) for row in rows_of(sweep.folder, sweep.jobs)]
-    require_measured(select, numbers, list(cfg.get("metric") or ()), existing, sweep.folder)
+    require_measured(select, numbers, list(cfg.get("metric") or ()), existing)
     ended = run_sweep(sweep, words, flags, on_start=partial(link, Path(LATEST)))
     if ended.was_dry:
         return ended.code
@@ -60,7 +60,7 @@ def run(
             print(f"cadam3d: {error}", file=sys.stderr)
     if choice is not None:
         _print(choice, ended.folder)
-    elif any(attempt.measured for attempt in attempts):
+    elif any(attempt.numbers for attempt in attempts):
         names = preferred(numbers.values()) if select is None else [select]
         # The last of several needs no truth.
         line = measuring_line(ended.folder, numbers[names[-1]])

@@ -145,9 +145,7 @@ def _differences(jobs: Sequence[JobResult], numbers: Sequence[Number]) -> Iterat
             yield [f"{arm} - {baseline}", MINE, prompts, *cells]
 
 
-def _difference(
-    ours: Sequence[JobResult], theirs: Sequence[JobResult], number: Number, prompts: str
-) -> str:
+def _difference(ours: Sequence[JobResult], theirs: Sequence[JobResult], number: Number, prompts: str) -> str:
     """Return the difference of a number over the prompts and seeds in which both have it."""
     having = _values(ours, number), _values(theirs, number)
     shared = having[0].keys() & having[1].keys()

@@ -16,18 +16,11 @@ from omegaconf import OmegaConf
 
 from cadam3d.core.number import COUNT, Number
 from cadam3d.core.outcome import Outcome
-from cadam3d.io.records import (
-    Score,
-    declared,
-    latest_scores,
-    read_evaluation,
-    read_histograms,
-    read_quality,
-)
+from cadam3d.io.records import Score, read_histograms
 from cadam3d.report.formatting import number
 from cadam3d.settings.compose import compose, flatten
 from cadam3d.settings.options import option_names
-from cadam3d.sweep.folder import UNFINISHED, Row, load
+from cadam3d.sweep.folder import UNFINISHED, Row, load, numbers_of
 
 # The other outcomes leave nothing to measure.
 WITH_ASSET = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.OUT_OF_MEMORY)
@@ -88,9 +81,7 @@ class JobResult:
     objective: str  # the option of ``guidance`` it ran with; empty if that is not known
     category: str  # of its prompt; empty if it has none
     # The numbers of its asset, what their metrics have declared about them, and those that have a record of
-    # how they were measured. Those of eval.json replace those from the end of training, except that
-    # comparisons with a truth all come from one of the two, as in sweep.csv. A number that another one
-    # replaces is left out.
+    # how they were measured; see numbers_of.
     numbers: Mapping[str, float] = field(repr=False)
     declared: Mapping[str, Number] = field(repr=False)
     scores: Mapping[str, Score] = field(repr=False)
@@ -157,12 +148,7 @@ def _arm(row: Row, overrides: Mapping[str, Any]) -> str:
 
 def _result(row: Row, overrides: Mapping[str, Any], varied: Sequence[str], axes: Sequence[str]) -> JobResult:
     shipped = _shipped(_densifier(row, overrides))
-    # Whether a comparison with a truth comes from training or from eval.json is the same for all tables.
-    evaluation = read_evaluation(row.folder, row.summary)
-    known = declared(evaluation) | declared(row.summary)
-    truths = {name for name, each in known.items() if each.needs_truth}
-    others = {name: value for name, value in evaluation.items() if name not in truths}
-    sources = ({**row.summary, **read_quality(row.folder, row.summary)}, others)
+    known, numbers, scores = numbers_of(row)
     given = {key.removeprefix(PREFIX): value for key, value in overrides.items() if key.startswith(PREFIX)}
     thresholds = [key.removeprefix(PREFIX) for key in varied if key.startswith(PREFIX)]
     return JobResult(
@@ -179,18 +165,10 @@ def _result(row: Row, overrides: Mapping[str, Any], varied: Sequence[str], axes:
         seconds=number(row.summary.get("seconds")),
         objective=str(overrides.get(GUIDANCE) or row.summary.get(GUIDANCE) or ""),
         category=row.category,
-        numbers=_numbers(sources, known),
+        numbers=numbers,
         declared=known,
-        scores=latest_scores(sources),
+        scores=scores,
     )
-
-
-def _numbers(sources: Iterable[Mapping[str, Any]], known: Mapping[str, Number]) -> dict[str, float]:
-    """Return the declared numbers, later sources first, without those that another one replaces."""
-    merged = {name: number(each[name]) for each in sources for name in known if name in each}
-    found = {name: value for name, value in merged.items() if value is not None}
-    replaced = {known[name].replaces for name in found}
-    return {name: value for name, value in found.items() if name not in replaced}
 
 
 def _cell(row: Row, overrides: Mapping[str, Any], axes: Sequence[str]) -> Cell:

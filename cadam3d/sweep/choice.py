@@ -13,13 +13,12 @@ from cadam3d.core.checks import fail, require_choice, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.number import COUNT, Number
 from cadam3d.core.outcome import Outcome
-from cadam3d.io.jsonl import is_number
-from cadam3d.io.records import declared, difference, read_evaluation, read_scores
+from cadam3d.io.records import difference, read_scores
 from cadam3d.io.run_folder import LATEST, RUN_FOLDER, shown
 from cadam3d.settings.compose import slug
 from cadam3d.settings.line import key_of
 from cadam3d.settings.options import config_dir, option_class, option_names
-from cadam3d.sweep.folder import Job, Row
+from cadam3d.sweep.folder import Job, Row, numbers_of
 from cadam3d.sweep.grid import read_line, sweep_name
 from cadam3d.sweep.plan import (
     Composer,
@@ -42,8 +41,7 @@ class Attempt:
     """One attempt, with the numbers of its asset. Without an asset that can be compared it has none."""
 
     seed: int
-    measured: Mapping[str, float] = field(default_factory=dict)
-    evaluated: Mapping[str, float] = field(default_factory=dict)  # by cadam3d eval, after training
+    numbers: Mapping[str, float] = field(default_factory=dict)
     declared: Mapping[str, Number] = field(default_factory=dict)  # what is known about these numbers
 
 
@@ -111,48 +109,30 @@ def read_attempts(cfg: DictConfig, overrides: Sequence[str], options: Namespace)
 
 def attempt_of(row: Row) -> Attempt:
     """Return an attempt with its numbers; it has none if it has left no asset."""
-    seed, summary = row.swept["seed"], row.summary
-    if not row.has_result or row.outcome == Outcome.VANISHED or not summary.get("num_gaussians"):
+    seed = row.swept["seed"]
+    if not row.has_result or row.outcome == Outcome.VANISHED or not row.summary.get("num_gaussians"):
         return Attempt(seed)
-    evaluation = read_evaluation(row.folder, summary)
-    numbers = {
-        name: number
-        for name, number in (declared(evaluation) | declared(summary)).items()
-        if number.is_more_better is not None
-    }
-    measured, evaluated = (
-        {name: float(known[name]) for name in numbers if is_number(known.get(name))}
-        for known in (summary, evaluation)
-    )
-    # As in the tables, scores of an evaluation replace training's. ``require_one_method`` then refuses
-    # to compare scores that were measured in different ways.
-    scores = {name: score.value for name, score in read_scores(row.folder, summary).items()}
-    own = measured | {name: scores[name] for name in numbers if name in scores}
-    return Attempt(seed, own, evaluated, numbers)
+    known, numbers, _ = numbers_of(row)
+    compared = {name: each for name, each in known.items() if each.is_more_better is not None}
+    return Attempt(seed, {name: numbers[name] for name in compared if name in numbers}, compared)
 
 
 def choose(attempts: Sequence[Attempt], select: str | None) -> Choice | None:
     """Return the best attempt by the number ``select``; None if no attempt has that number.
 
-    ``None`` stands for the most preferred number that an attempt has (``Number.preference``). The numbers of
-    an evaluation after training count only if training has measured none of them in any attempt, because both
-    may have been measured with different settings. Of attempts with equal numbers, the one with the lowest
-    seed is the best.
+    ``None`` stands for the most preferred number that an attempt has (``Number.preference``). Of attempts
+    with equal numbers, the one with the lowest seed is the best.
     """
     known = {name: number for attempt in attempts for name, number in attempt.declared.items()}
     for name in preferred(known.values()) if select is None else (select,):
         replacing = [number.name for number in known.values() if number.replaces == name]
         for key in (*replacing, name):
-            for numbers in (
-                {attempt.seed: attempt.measured for attempt in attempts},
-                {attempt.seed: attempt.evaluated for attempt in attempts},
-            ):
-                values = {seed: own[key] for seed, own in numbers.items() if key in own}
-                if values:
-                    merit = known[key].merit
-                    ordered = sorted(values, key=lambda seed: (-merit(values[seed]), seed))
-                    without = sorted(seed for seed in numbers if seed not in values)
-                    return Choice(known[key], {seed: values[seed] for seed in ordered}, without)
+            values = {each.seed: each.numbers[key] for each in attempts if key in each.numbers}
+            if values:
+                merit = known[key].merit
+                ordered = sorted(values, key=lambda seed: (-merit(values[seed]), seed))
+                without = sorted(each.seed for each in attempts if each.seed not in values)
+                return Choice(known[key], {seed: values[seed] for seed in ordered}, without)
     return None
 
 
@@ -181,13 +161,11 @@ def require_measured(
     known: Mapping[str, Number],
     chosen: Sequence[str],
     attempts: Sequence[Attempt],
-    folder: Path,
 ) -> None:
     """Raise ``UserError`` if the attempts will lack the number that they are compared by.
 
     ``known`` are the numbers by which attempts can be compared, whichever metrics were chosen. ``chosen`` are
-    the metrics of the line. ``attempts`` are those that are in ``folder`` already, where ``cadam3d eval`` may
-    have measured the number.
+    the metrics of the line. ``attempts`` exist already, and ``cadam3d eval`` may have measured the number.
     """
     if select is not None:
         require_choice("select", select, tuple(known))

@@ -10,9 +10,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cadam3d.core.errors import UserError
+from cadam3d.core.number import Number
 from cadam3d.core.outcome import Outcome
-from cadam3d.io.jsonl import read_json, to_json, write_json
-from cadam3d.io.records import read_summary
+from cadam3d.io.jsonl import is_number, read_json, to_json, write_json
+from cadam3d.io.records import (
+    Score,
+    declared,
+    latest_scores,
+    read_evaluation,
+    read_quality,
+    read_summary,
+)
 from cadam3d.io.run_folder import JOBS, has_checkpoint
 
 # The outcome of a job that waits, runs, or has ended without a summary.
@@ -93,6 +101,25 @@ def rows_of(sweep: Path, jobs: Sequence[Job]) -> list[Row]:
         Row(**vars(job), number=number, folder=folder, summary=read_summary(folder))
         for number, (job, folder) in enumerate(zip(jobs, folders, strict=True))
     ]
+
+
+def numbers_of(row: Row) -> tuple[dict[str, Number], dict[str, float], dict[str, Score]]:
+    """Return what is declared about the numbers of a job's asset, these numbers, and those with a record.
+
+    Those of ``eval.json`` replace those from the end of training, except that comparisons with a truth all
+    come from one of the two, as in ``sweep.csv``. A number that another one replaces is left out.
+    """
+    evaluation = read_evaluation(row.folder, row.summary)
+    known = declared(evaluation) | declared(row.summary)
+    later = {
+        name: value for name, value in evaluation.items() if not (name in known and known[name].needs_truth)
+    }
+    sources = ({**row.summary, **read_quality(row.folder, row.summary)}, later)
+    merged = {name: each[name] for each in sources for name in known if name in each}
+    found = {name: float(value) for name, value in merged.items() if is_number(value)}
+    replaced = {known[name].replaces for name in found}
+    values = {name: value for name, value in found.items() if name not in replaced}
+    return known, values, latest_scores(sources)
 
 
 def is_sweep(folder: Path) -> bool:
