@@ -267,13 +267,7 @@ def test_a_named_pipe_among_the_files_of_the_user_is_not_read(capsys, monkeypatc
     "values",
     [
         *("range(0)", "range(5,1)", "range(0,1,0)", "range(0,nan)", "range(0,inf)", "range(0,1000000000)"),
-        *(
-            "range(0,1,1e-30)",
-            "shuffle(range(0,1000000000))",
-            "glob(*)",
-            "interval(0,1)",
-            "1," * 100_000 + "1",
-        ),
+        *("range(0,1,1e-30)", "glob(*)", "interval(0,1)", "1," * 100_000 + "1"),
     ],
 )
 def test_a_sweep_without_values_or_with_too_many_is_refused(values):
@@ -285,9 +279,7 @@ def test_the_jobs_of_a_sweep_are_counted_before_they_are_made():
     line = read_line(
         [f"{key}=range(1,11)" for key in ("seed", "views", "steps", "camera.size", "refine.start")]
     )
-    with pytest.raises(
-        UserError, match=rf"^seed: expected at most {MOST_JOBS} jobs in a sweep, got 100000\."
-    ):
+    with pytest.raises(UserError, match=rf"^sweep: expected at most {MOST_JOBS} jobs, got 100000\."):
         expand(read_grid(None), line)
 
 

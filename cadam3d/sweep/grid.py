@@ -10,14 +10,16 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import product
-from typing import Any
+from itertools import islice, product
+from typing import Any, ClassVar
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Glob, Override, RangeSweep
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
 
-from cadam3d.core.checks import fail, require
+from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import to_json
 from cadam3d.io.prompt_files import Prompt
@@ -34,8 +36,6 @@ ALWAYS_SHOWN = ("prompt", "seed")
 # Each job starts a process, which takes seconds, and is a row of a table. With this many jobs, the starts
 # alone take a day, and the table is too long to read.
 MOST_JOBS = 10_000
-KEYS = ("each", "arms", "prompts", "figures", "paper_table")  # of a grid
-A_RANGE = "range(0,3)"
 # Lists the grids of the package, for messages about one that cannot be read.
 EXAMPLE = "cadam3d sweep --help grid"
 
@@ -81,34 +81,38 @@ class Grid:
 HasSetting = Callable[[Sequence[str], str], bool]
 
 
+@dataclass(frozen=True)
+class GridFile:
+    """The keys of a grid in YAML, which pydantic checks."""
+
+    __pydantic_config__: ClassVar = {"extra": "forbid"}
+
+    each: dict[str, Any] | None = None
+    arms: dict[str, dict[str, Any] | None] | None = None
+    prompts: str | None = None
+    figures: list[str] | None = None
+    paper_table: bool = False
+
+
 def read_grid(node: Any) -> Grid:
     """Return the grid that plain dicts and lists describe; None describes a grid of one nameless arm.
 
     Raises ``UserError`` for keys that :class:`Grid` does not have and for wrong values of these.
     """
-    if node is None:
-        return Grid(each={}, arms={"": {}})
-    is_grid = isinstance(node, dict) and bool(node) and node.keys() <= set(KEYS)
-    require(is_grid, "grid", expected=", ".join(KEYS), got=node, example=EXAMPLE)
-    given = {name: value for name, value in node.items() if value is not None}
-    arms = given.get("arms", {"": {}})
-    is_named = isinstance(arms, dict) and bool(arms)
-    require(is_named, "grid.arms", expected="named arms", got=arms, example=EXAMPLE)
-    figures = given.get("figures")
-    are_names = figures is None or (isinstance(figures, list) and all(isinstance(f, str) for f in figures))
-    example = "'grid.figures=[frontier]'"
-    require(are_names, "grid.figures", expected="a list of names", got=figures, example=example)
-    has_table, key = given.get("paper_table", False), "grid.paper_table"
-    require(isinstance(has_table, bool), key, expected="true or false", got=has_table, example=f"{key}=true")
-    prompts, key = given.get("prompts"), "grid.prompts"
-    is_source = prompts is None or isinstance(prompts, str)
-    require(is_source, key, expected="a file or a set", got=prompts, example=f"{key}=paper50")
+    from pydantic import TypeAdapter, ValidationError  # takes a tenth of a second to load
+
+    try:
+        file = TypeAdapter(GridFile).validate_python({} if node is None else node)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(["grid", *map(str, first["loc"])])
+        raise UserError(f"{key}: {first['msg']}, got {first['input']!r}. Try: {EXAMPLE}") from error
     return Grid(
-        each=_axes(given.get("each"), "grid.each"),
-        arms={str(name): _axes(axes, f"grid.arms.{name}") for name, axes in arms.items()},
-        prompts=prompts,
-        figures=figures,
-        paper_table=has_table,
+        each=_axes(file.each or {}, "grid.each"),
+        arms={name: _axes(axes or {}, f"grid.arms.{name}") for name, axes in (file.arms or {"": {}}).items()},
+        prompts=file.prompts,
+        figures=file.figures,
+        paper_table=file.paper_table,
     )
 
 
@@ -151,7 +155,9 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
     arms = {
         name: {key: line.get(key, axis) for key, axis in axes.items()} for name, axes in grid.arms.items()
     }
-    _require_few_jobs(common, arms)
+    number = sum(math.prod(map(len, [*common.values(), *axes.values()])) for axes in arms.values())
+    expected = f"at most {MOST_JOBS} jobs"
+    require(number <= MOST_JOBS, "sweep", expected=expected, got=number, example="cadam3d sweep --help")
     foreign = _foreign(grid, line, arms, has_setting)
     named, counted = _named(grid, line), swept_keys(grid, line)
     found: dict[frozenset[str], Job] = {}
@@ -192,7 +198,8 @@ def swept_keys(grid: Grid, line: Axes) -> list[str]:
     """
     keys = [*grid.each, *(key for axes in grid.arms.values() for key in axes)]
     keys += [key for key, axis in line.items() if len(axis) > 1 or key in ALWAYS_SHOWN]
-    keys += [key for key in _brought_keys(line) if key not in line]
+    brought = [each.key for axis in line.values() for setting in axis for each in setting.more]
+    keys += [key for key in brought if key not in line]
     return list(dict.fromkeys(keys))
 
 
@@ -219,21 +226,13 @@ def sweep_name(grid_name: str | None, line: Axes, prompts: PromptChoice | None =
     return f"{slug(*words)}_{_digest(parts)}{suffix}"
 
 
-def _axes(node: Any, where: str) -> Axes:
-    if node is None:
-        return {}
-    if not isinstance(node, dict):
-        raise UserError(
-            f"{where}: expected keys with values, got {node!r}. Try: '++{where}={{seed: [0, 1]}}'"
-        )
-    return {str(key).lstrip("+"): _axis(str(key), value, where) for key, value in node.items()}
-
-
-def _axis(key: str, value: Any, where: str) -> list[AxisValue]:
-    values = value if isinstance(value, list) else [value]
-    if not values:
-        raise UserError(f"{where}: {key} has no values. Try: {EXAMPLE}")
-    return [_setting(f"{key}={_grammar(key, each)}") for each in values]
+def _axes(node: Mapping[str, Any], where: str) -> Axes:
+    axes = {}
+    for key, value in node.items():
+        values = value if isinstance(value, list) else [value]
+        require(bool(values), f"{where}.{key}", expected="a value or several", got=value, example=EXAMPLE)
+        axes[key.lstrip("+")] = [_setting(f"{key}={_grammar(key, each)}") for each in values]
+    return axes
 
 
 def _grammar(key: str, value: Any) -> str:
@@ -251,41 +250,19 @@ def _grammar(key: str, value: Any) -> str:
 
 
 def _alternatives(line: str) -> list[str]:
+    key, _, text = line.partition("=")
+    expected, example = f"from 1 to {MOST_JOBS} values", f"'{key}=range(0,3)'"
     # Hydra's parser needs a minute for a list of this length.
-    _require_few(line.partition("=")[0], line.count(",") + 1)
+    require(text.count(",") < MOST_JOBS, key, expected=expected, got=text, example=example)
     override = _parsed(line)
     if not override.is_sweep_override():
         return [line]
-    key, sweep = override.get_key_element(), override.value()
-    if not override.is_discrete_sweep() or isinstance(sweep, Glob):
-        what = "a pattern" if isinstance(sweep, Glob) else "an interval"
-        raise fail(key, expected="values one by one", got=what, example=f"'{key}={A_RANGE}'")
-    if isinstance(sweep, RangeSweep):
-        _require_few(key, _length(sweep))
-    return [f"{key}={value}" for value in override.sweep_string_iterator()]
-
-
-def _length(sweep: RangeSweep) -> int:
-    """Return how many values a range has, without making them; 0 for one without a plain number of them."""
-    try:
-        return math.ceil((sweep.stop - sweep.start) / sweep.step)  # pyright: ignore[reportOperatorIssue]
-    except (TypeError, ValueError, ArithmeticError):
-        return 0
-
-
-def _require_few(key: str, count: int) -> None:
-    expected, example = f"from 1 to {MOST_JOBS} values", f"'{key}={A_RANGE}'"
-    require(1 <= count <= MOST_JOBS, key, expected=expected, got=count, example=example)
-
-
-def _require_few_jobs(common: Axes, arms: Mapping[str, Axes]) -> None:
-    """Raise ``UserError`` for too many jobs. It names the key with most values."""
-    number = math.prod(map(len, common.values()))
-    number *= sum(math.prod(map(len, axes.values())) for axes in arms.values())
-    if number > MOST_JOBS:
-        longest = max((axis for axes in (common, *arms.values()) for axis in axes.values()), key=len)[0].key
-        expected, example = f"at most {MOST_JOBS} jobs in a sweep", "cadam3d sweep --help"
-        raise fail(longest, expected=expected, got=number, example=example)
+    values = []
+    # An interval, a pattern and a range without an end or with the step 0 cannot be enumerated.
+    with suppress(HydraException, ValueError, ArithmeticError):
+        values = list(islice(override.sweep_string_iterator(), MOST_JOBS + 1))
+    require(1 <= len(values) <= MOST_JOBS, key, expected=expected, got=text, example=example)
+    return [f"{key}={value}" for value in values]
 
 
 def _setting(line: str) -> AxisValue:
@@ -318,10 +295,6 @@ def _brought(settings: Sequence[AxisValue], has_setting: HasSetting) -> list[Axi
     keys, lines = {setting.key for setting in settings}, [setting.line for setting in settings]
     brought = [each for setting in settings for each in setting.more]
     return [each for each in brought if each.key not in keys and has_setting(lines, each.key)]
-
-
-def _brought_keys(line: Axes) -> list[str]:
-    return [each.key for axis in line.values() for setting in axis for each in setting.more]
 
 
 def _named(grid: Grid, line: Axes) -> set[str]:

@@ -191,25 +191,21 @@ def test_all_keys_in_which_jobs_may_differ_are_listed(pareto):
 
 
 @pytest.mark.parametrize(
-    ("node", "expected"),
+    ("node", "key"),
     [
-        (
-            {"densifier": "baseline,cadam"},
-            "grid: expected each, arms, prompts, figures, paper_table, got",
-        ),
-        ([1], "grid: expected each, arms, prompts, figures, paper_table, got"),
-        ({"paper_table": "yes"}, "grid.paper_table: expected true or false"),
-        ({"arms": {}}, "grid.arms: expected named arms"),
-        ({"arms": ["a"]}, "grid.arms: expected named arms"),
-        ({"arms": {"a": 1}}, "grid.arms.a: expected keys with values, got 1"),
-        ({"each": {"seed": []}}, "grid.each: seed has no values"),
+        ({"densifier": "baseline,cadam"}, "grid.densifier"),
+        ([1], "grid"),
+        ({"paper_table": "perhaps"}, "grid.paper_table"),
+        ({"prompts": [1]}, "grid.prompts"),
+        ({"figures": "growth"}, "grid.figures"),
+        ({"arms": ["a"]}, "grid.arms"),
+        ({"arms": {"a": 1}}, "grid.arms.a"),
+        ({"each": {"seed": []}}, "grid.each.seed"),
     ],
 )
-def test_an_invalid_grid_is_refused(node, expected):
-    with pytest.raises(UserError) as caught:
+def test_an_invalid_grid_is_refused(node, key):
+    with pytest.raises(UserError, match=rf"^{key}: .*, got .* Try: "):
         read_grid(node)
-    assert str(caught.value).startswith(expected)
-    assert "Try: " in str(caught.value)
 
 
 @pytest.mark.parametrize(

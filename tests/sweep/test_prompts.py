@@ -86,8 +86,6 @@ def test_the_file_of_a_grid_is_replaced_by_that_of_the_line():
     assert read_choice({"file": None, "first": 3}, "shapes6").source == "shapes6"
     assert read_choice({"file": "paper50"}, "shapes6").source == "paper50"
     assert read_grid({"prompts": "shapes6"}).prompts == "shapes6"
-    with pytest.raises(UserError, match=r"grid\.prompts: expected a file or a set"):
-        read_grid({"prompts": [1]})
 
 
 # --- jobs -------------------------------------------------------------------------------------------------
