@@ -1,7 +1,7 @@
 """Candidates: pictures of the Gaussians that each refinement selects, and score histograms (paper fig. 6)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -84,13 +84,7 @@ class Candidates(PictureSettings, Callback):
 def marked(gaussians: Gaussians, is_selected: Bool[Tensor, "n"]) -> Gaussians:
     """Return the same Gaussians in two plain colours, one for the selected and one for the others."""
     colors = gaussians.sh.new_tensor([OTHERS, SELECTED])[is_selected.long()]
-    return Gaussians(
-        means=gaussians.means,
-        log_scales=gaussians.log_scales,
-        quats=gaussians.quats,
-        opacity_logits=gaussians.opacity_logits,
-        sh=rgb_to_sh0(colors)[:, None],
-    )
+    return replace(gaussians, sh=rgb_to_sh0(colors)[:, None])
 
 
 def histogram(

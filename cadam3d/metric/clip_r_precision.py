@@ -13,7 +13,7 @@ from cadam3d.core.checks import require
 from cadam3d.core.number import Number
 from cadam3d.io.prompt_files import read_prompts
 from cadam3d.metric.clip import ClipMetric, load_clip
-from cadam3d.metric.scoring import LEVEL, Scorer, interval_record
+from cadam3d.metric.scoring import LEVEL, Scorer
 
 KEY = "metric.clip_r_precision.prompts"
 BATCH = 64  # texts that are read at once
@@ -66,7 +66,8 @@ class ClipRPrecision(ClipMetric):
         from scipy.stats import binomtest  # slow to import
 
         found = binomtest(round(float(values.sum())), len(values)).proportion_ci(LEVEL, method="wilson")
-        return interval_record(found.low, found.high, "the share over viewpoints, by Wilson's formula")
+        of = "the share over viewpoints, by Wilson's formula"
+        return {"low": found.low, "high": found.high, "level": LEVEL, "of": of}
 
 
 def read_candidates(source: str) -> list[str]:

@@ -1,6 +1,5 @@
 """Fidelity: how close the renders are to the true images, if those are known."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -81,43 +80,34 @@ class Fidelity(HeldOutSettings, Metric):
         truth = measurand.truth
         if truth is None:
             return Measurement({})
-        truths = [truth, truth.turned()] if truth.turn_deg else [truth]
-        unturned, *others = self._compare(measurand.render, truths)
+        unturned = self._compare(measurand.render, truth)
         if truth.turn_deg is None:
             return Measurement(unturned)
-        turned = others[0] if others else unturned
+        turned = self._compare(measurand.render, truth.turned()) if truth.turn_deg else unturned
         at_turn = {"psnr_turned": turned["psnr"], "ssim_turned": turned["ssim"], "turn_deg": truth.turn_deg}
         return Measurement(unturned | at_turn)
 
     def measure_start(self, measurand: Measurand) -> dict[str, float]:
         """Return ``psnr_start`` (dB), against the images with which ``psnr_turned`` compares the asset."""
         assert measurand.truth is not None
-        return {"psnr_start": self._compare(measurand.render, [measurand.truth.turned()])[0]["psnr"]}
+        return {"psnr_start": self._compare(measurand.render, measurand.truth.turned())["psnr"]}
 
-    def _compare(self, render: RenderFn, truths: Sequence[Truth]) -> list[dict[str, float]]:
-        """Return the four numbers of every truth. Each view is rendered once."""
-        psnrs: list[list[Tensor]] = [[] for _ in truths]
-        ssims: list[list[Tensor]] = [[] for _ in truths]
+    def _compare(self, render: RenderFn, truth: Truth) -> dict[str, float]:
+        """Return the four numbers of the mode that fits best."""
+        psnrs, ssims = [], []
         for cameras, background in self.parts():
             images = render(cameras, background).rgb.detach().float().cpu().clamp(0, 1)
-            for number, truth in enumerate(truths):
-                modes = truth.images(cameras, background).detach().float().cpu()
-                psnrs[number].append(_psnr(images, modes))
-                ssims[number].append(_ssim(images, modes))
-        return [
-            _best_mode(torch.cat(psnr_db, dim=1), torch.cat(similarity, dim=1))
-            for psnr_db, similarity in zip(psnrs, ssims, strict=True)
-        ]
-
-
-def _best_mode(psnr_db: Float[Tensor, "m v"], similarity: Float[Tensor, "m v"]) -> dict[str, float]:
-    best = int(psnr_db.mean(dim=1).argmax())
-    return {
-        "psnr": float(psnr_db[best].mean()),
-        "psnr_min": float(psnr_db[best].min()),
-        "ssim": float(similarity[best].mean()),
-        "mode": float(best),
-    }
+            modes = truth.images(cameras, background).detach().float().cpu()
+            psnrs.append(_psnr(images, modes))
+            ssims.append(_ssim(images, modes))
+        psnr_db, similarity = torch.cat(psnrs, dim=1), torch.cat(ssims, dim=1)
+        best = int(psnr_db.mean(dim=1).argmax())
+        return {
+            "psnr": float(psnr_db[best].mean()),
+            "psnr_min": float(psnr_db[best].min()),
+            "ssim": float(similarity[best].mean()),
+            "mode": float(best),
+        }
 
 
 def _psnr(images: Float[Tensor, "v h w 3"], modes: Float[Tensor, "m v h w 3"]) -> Float[Tensor, "m v"]:

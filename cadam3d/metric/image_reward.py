@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.errors import UserError
@@ -72,8 +71,16 @@ class ImageReward(ScoreMetric):
                 f"{DOWNLOAD}. Then: {self.node}.model={FOLDER}"
             ) from error
         installed = next((each.version for each in distributions(name=PACKAGE)), None)
+
+        def score(images: Tensor, text: str) -> Tensor:
+            from PIL import Image
+
+            with torch.no_grad():
+                rewards = [model.score(text, Image.fromarray(picture)) for picture in to_uint8(images)]
+            return torch.tensor(rewards, dtype=torch.float64)
+
         return Scorer(
-            score=lambda images, text: _rewards(model, images, text),
+            score=score,
             facts={**facts, "package": installed},
             complaints=lambda text: too_long(len(model.blip.tokenizer(text)["input_ids"]), LONGEST),
         )
@@ -103,11 +110,3 @@ def _loaded(package: Any, name: str, folder: Path, device: torch.device) -> Any:
     settings = None if name == NAME else str(folder / SETTINGS)
     with redirect_stdout(StringIO()):  # the package prints where it loads from
         return package.load(name, device=device, download_root=str(folder), med_config=settings)
-
-
-def _rewards(model: Any, images: Float[Tensor, "v h w 3"], text: str) -> Float[Tensor, "v"]:
-    from PIL import Image
-
-    with torch.no_grad():
-        rewards = [model.score(text, Image.fromarray(picture)) for picture in to_uint8(images)]
-    return torch.tensor(rewards, dtype=torch.float64)

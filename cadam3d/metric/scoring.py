@@ -67,19 +67,17 @@ class ScoreMetric(Metric):
         return replace(self.measurement(values, text, scorer.facts), warnings=scorer.complaints(text))
 
     def values(self, measurand: Measurand, scorer: Scorer, text: str) -> Float[Tensor, "v"]:
-        """Return the score of every view of the protocol."""
-        scores = [self.scores(scorer, images, text) for images in self.protocol.images(measurand.render)]
+        """Return the score of every view of the protocol. Raises ``UserError`` if the model fails."""
+        scores = []
+        for images in self.protocol.images(measurand.render):
+            try:
+                scores.append(scorer.score(images, text).detach().double().cpu())
+            # Models and the preparation of their inputs raise almost any exception.
+            except Exception as error:
+                if is_out_of_memory(error):
+                    raise
+                raise self.failure(short(error)) from error
         return torch.cat(scores)
-
-    def scores(self, scorer: Scorer, images: Float[Tensor, "v h w 3"], text: str) -> Float[Tensor, "v"]:
-        """Return the score of each image. Raises ``UserError`` if the model fails or returns no numbers."""
-        try:
-            return scorer.score(images, text).detach().double().cpu()
-        # Models and the preparation of their inputs raise almost any exception, which must not end a run.
-        except Exception as error:
-            if is_out_of_memory(error):
-                raise
-            raise self.failure(short(error)) from error
 
     def failure(self, reason: str) -> UserError:
         """Return the error for a model that cannot score an asset."""
@@ -107,14 +105,14 @@ class ScoreMetric(Metric):
         It is Student's t interval, which treats the views as a random sample of viewpoints. It says how much
         the choice of the viewpoints matters for this asset, and nothing about other seeds or prompts.
         """
-        count = len(values)
-        if count < 2:
+        if len(values) < 2:
             return None
         from scipy.stats import t  # slow to import
 
-        half = float(t.ppf((1 + LEVEL) / 2, count - 1)) * float(values.std()) / math.sqrt(count)
-        mean = float(values.mean())
-        return interval_record(mean - half, mean + half, "the mean over viewpoints, by Student's t")
+        error = float(values.std()) / math.sqrt(len(values))
+        mean, half = float(values.mean()), float(t.ppf((1 + LEVEL) / 2, len(values) - 1)) * error
+        of = "the mean over viewpoints, by Student's t"
+        return {"low": mean - half, "high": mean + half, "level": LEVEL, "of": of}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,8 +154,3 @@ def too_long(tokens: int, longest: int) -> tuple[str, ...]:
     """Return a warning about a text if it has more tokens than the ``longest`` that the model reads."""
     read = f"the model reads {longest} tokens, and the others of the {tokens} in the text are not scored"
     return (f"{read}. Try: a shorter prompt",) if tokens > longest else ()
-
-
-def interval_record(low: float, high: float, of: str) -> dict[str, Any]:
-    """Return an interval for the record of a number; ``of`` says what it is an interval of, and how."""
-    return {"low": low, "high": high, "level": LEVEL, "of": of}

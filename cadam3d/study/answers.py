@@ -167,6 +167,6 @@ def _rater(file: AnswerFile, key: Key) -> Rater:
             catches.append(pick.chosen == trial.right)
             continue
         [other] = set(trial.clips) - {pick.chosen}
-        chosen, lost = key.clips[pick.chosen].arm, key.clips[other].arm
+        chosen, lost = key.clips[pick.chosen].run.arm, key.clips[other].run.arm
         answers.append(Answer(file.rater, trial.prompt, pick.question, chosen, lost))
     return Rater(file.rater, tuple(answers), tuple(catches))

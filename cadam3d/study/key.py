@@ -1,6 +1,6 @@
 """Key: ``key.json``, which says what the clips of a page show. It stays with the experimenter."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -12,25 +12,13 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.reading import read_bytes
 from cadam3d.io.run_folder import shown
-from cadam3d.study.trials import StudyPlan, Trial
+from cadam3d.study.trials import ClipSource, StudyPlan, Trial
 
 KEY = "key.json"
 PAGE = "study.html"
 RESULTS = "study.json"
 TABLE = "study.md"
 LARGEST_KEY = 1 << 24  # bytes
-
-
-@dataclass(frozen=True, kw_only=True)
-class KeyClip:
-    """The facts about what a clip shows."""
-
-    arm: str  # of a ruined clip, its run's arm
-    prompt: str
-    seed: int
-    conditions: dict[str, str]
-    run: str
-    is_ruined: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +30,7 @@ class Key:
     study: str  # its name, which the page and the files of answers have too
     cadam3d: str = __version__
     seed: int
-    arms: tuple[str, ...]
-    clips: tuple[KeyClip, ...]
+    clips: tuple[ClipSource, ...]
     trials: tuple[Trial, ...]
 
     @property
@@ -54,19 +41,8 @@ class Key:
 
 def write_key(path: Path, study: str, plan: StudyPlan, *, seed: int) -> None:
     """Write the key of a study. Raises ``UserError`` if the file cannot be written."""
-    clips = tuple(
-        KeyClip(
-            arm=source.run.arm,
-            prompt=source.run.prompt,
-            seed=source.run.seed,
-            conditions=dict(source.run.conditions),
-            run=str(shown(source.run.folder)),
-            is_ruined=source.is_ruined,
-        )
-        for source in plan.sources
-    )
-    arms = tuple(sorted({clip.arm for clip in clips}))
-    write_json(path, asdict(Key(study=study, seed=seed, arms=arms, clips=clips, trials=plan.trials)))
+    key = Key(study=study, seed=seed, clips=plan.sources, trials=plan.trials)
+    write_json(path, TypeAdapter(Key).dump_python(key, mode="json"))
 
 
 def read_key(path: Path) -> Key:

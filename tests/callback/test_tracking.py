@@ -16,7 +16,7 @@ from cadam3d.callback.base import Callback
 from cadam3d.callback.previews import Previews
 from cadam3d.callback.tensorboard import TensorBoard
 from cadam3d.callback.tracking import Tracking
-from cadam3d.callback.wandb import Wandb, brings_settings, refused
+from cadam3d.callback.wandb import Wandb, brings_settings, known_run, refused
 from cadam3d.core.console import heard_by
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import JOBS, occupant
@@ -320,8 +320,17 @@ def test_nothing_that_wandb_could_collect_by_itself_is_in_its_files(offline):
         str(Path.cwd()).encode(),
     ]
     assert not [each for each in unwanted if each in content]
-    names = {path.name for path in (offline[0] / "wandb").rglob("*") if path.is_file()}
+    files = list((offline[0] / "wandb").rglob("*"))
+    assert not [path for path in files if path.is_symlink()]
+    names = {path.name for path in files if path.is_file()}
     assert not names & {"requirements.txt", "wandb-metadata.json", "output.log", "conda-environment.yaml"}
+
+
+@pytest.mark.slow
+def test_the_run_says_that_nothing_is_sent_and_does_not_change(offline, track, tmp_path):
+    assert "nothing is sent (there is no API key" in offline[1][0]
+    state = track(tmp_path, steps=8)
+    assert torch.equal(state.gaussians.means, offline[2].gaussians.means)
 
 
 @pytest.mark.slow
@@ -349,7 +358,16 @@ def test_settings_of_wandb_in_the_folder_of_a_run_are_of_unknown_origin(tmp_path
     assert not brings_settings(job)
 
 
-FOREIGN = [None, "", "[]", '{"id": "../evil", "recorded": 3}', '{"id": "0123456789abcdef"}']
+@pytest.mark.parametrize(
+    "content", [None, "", "[]", '{"id": "../evil", "recorded": 3}', '{"id": "0123456789abcdef"}']
+)
+def test_a_record_that_this_program_has_not_written_begins_a_new_run(content, tmp_path):
+    path = tmp_path / "cadam3d.json"
+    if content is not None:
+        path.write_text(content)
+    name, recorded = known_run(path)
+    assert len(name) == 16
+    assert recorded == 0
 
 
 def test_wrong_values_name_their_key():

@@ -52,7 +52,7 @@ def answered(key: dict, rater: str, choose, *, saves=1) -> dict:
     """Return the file of a rater who has answered everything as ``choose(trial, arms of its clips)`` says."""
     answers = []
     for number, trial in enumerate(key["trials"]):
-        names = [key["clips"][clip]["arm"] for clip in trial["clips"]]
+        names = [key["clips"][clip]["run"]["arm"] for clip in trial["clips"]]
         chosen = trial["clips"][choose(trial, names)]
         answers += [
             {"trial": number, "shown": trial["clips"], "question": name, "chosen": chosen, "seconds": 1}
@@ -113,8 +113,8 @@ def test_the_key_has_the_arms_of_all_clips_and_is_of_this_page(arms, type_line, 
     for trial in key["trials"]:
         clips = [key["clips"][clip] for clip in trial["clips"]]
         if trial["right"] is None:
-            assert {clip["arm"] for clip in clips} == set(ARMS)
-            assert {clip["prompt"] for clip in clips} == {trial["prompt"]}
+            assert {clip["run"]["arm"] for clip in clips} == set(ARMS)
+            assert {clip["run"]["prompt"] for clip in clips} == {trial["prompt"]}
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_one_another_study(arms, type_line, tmp_path):
@@ -129,7 +129,7 @@ def test_the_numbers_of_the_clips_cannot_be_computed_from_the_page_and_the_seed(
     keys = []
     for name in ("one", "two"):
         assert type_line("study", arms, *SMALL, f"output={name}").code == 0
-        keys.append([clip["run"] for clip in read_json(tmp_path / name / "key.json")["clips"]])
+        keys.append([clip["run"]["folder"] for clip in read_json(tmp_path / name / "key.json")["clips"]])
         for number, arm in enumerate(ARMS):  # other assets of the same prompts
             asset = tmp_path / arm / "0/asset.ply"
             asset.write_bytes(

@@ -8,19 +8,18 @@ import pytest
 
 from cadam3d.core.errors import UserError
 from cadam3d.study.answers import LARGEST_FILE, collect, find_files, read_files
-from cadam3d.study.key import Key, KeyClip, read_key, write_key
+from cadam3d.study.key import Key, read_key, write_key
 from cadam3d.study.questions import QUESTION_NAMES
 from cadam3d.study.runs import RunPair, StudyRun
-from cadam3d.study.trials import Trial, make_plan
+from cadam3d.study.trials import ClipSource, Trial, make_plan
 
 STUDY = "0123456789abcdef"
 # Clips 0 and 2 are of heron, 1 and 3 of stork, and 4 is a ruined one. Trial 1 is a catch trial.
 KEY = Key(
     study=STUDY,
     seed=0,
-    arms=("heron", "stork"),
     clips=tuple(
-        KeyClip(arm=arm, prompt="a cube", seed=0, conditions={}, run=arm, is_ruined=False)
+        ClipSource(StudyRun(Path(arm), arm, "a cube", 0), is_ruined=False)
         for arm in ("heron", "stork", "heron", "stork", "heron")
     ),
     trials=(Trial("a cube", (0, 1)), Trial("a cube", (4, 1), right=1), Trial("a cone", (3, 2))),
@@ -195,8 +194,8 @@ def test_a_key_is_read_as_it_was_written(tmp_path):
     write_key(tmp_path / "key.json", STUDY, plan, seed=0)
     key = read_key(tmp_path / "key.json")
     assert key.trials == plan.trials
-    assert [clip.arm for clip in key.clips] == [source.run.arm for source in plan.sources]
-    assert (key.study, key.arms, key.catch_trials) == (STUDY, ("heron", "stork"), 1)
+    assert key.clips == plan.sources
+    assert (key.study, key.catch_trials) == (STUDY, 1)
 
 
 @pytest.mark.parametrize(
