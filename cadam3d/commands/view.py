@@ -15,11 +15,13 @@ from cadam3d.commands.opened import find_asset, find_run, require_one
 from cadam3d.core.checks import require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.io.asset_file import read_gaussians
-from cadam3d.io.run_folder import REPORT, expanded, has_file, shown, typed_path
+from cadam3d.io.lock import is_held
+from cadam3d.io.run_folder import LOCK, REPORT, expanded, has_file, shown, typed_path
 from cadam3d.live.server import HOST, Server
 from cadam3d.live.subject import ShownFile, ShownRun
 from cadam3d.settings.compose import Call
 from cadam3d.sweep.folder import is_sweep
+from cadam3d.viewer.pack import pack
 
 
 def run(cfg: DictConfig, _call: Call) -> None:
@@ -32,10 +34,16 @@ def run(cfg: DictConfig, _call: Call) -> None:
         print(f"{'Opened' if is_open else 'Open this in a browser:'} {shown(page)}")
         return
     subject = _subject(cfg)
-    subject.load()
-    with _ended_by_signals(), _listening(subject, cfg.port) as server:
+    try:
+        server = Server(subject, cfg.port)
+    except OSError as error:
+        got = f"{cfg.port} ({error.strerror})"
+        raise UserError(f"port: expected a free port, got {got}. Try: port=0") from error
+    tunnel = f"ssh -L {server.server_port}:{HOST}:{server.server_port} {socket.gethostname()}"
+    with _ended_by_signals(), server:
         print(server.address)
-        print(_hint(server.server_port), flush=True)
+        print(f"Ctrl-C ends the server. To open the address on another machine, first type there: {tunnel}")
+        sys.stdout.flush()
         if cfg.open and has_display():
             webbrowser.open(server.address)
         server.serve_forever()
@@ -62,22 +70,12 @@ def _ended_by_signals() -> Iterator[None]:
 
 
 def _subject(cfg: DictConfig) -> ShownFile:
+    """Return what the page shows. Raises ``UserError`` if there is nothing that can be read."""
     if cfg.ply is not None:
         file = expanded(str(cfg.ply))
-        return ShownFile(file, lambda: read_gaussians(file, up=cfg.ply_up))
-    folder = find_run(str(cfg.run))
-    return ShownRun(folder, lambda: read_gaussians(find_asset(folder)))
-
-
-def _listening(subject: ShownFile, port: int) -> Server:
-    """Return a server that listens. Raises ``UserError`` if the port is not free."""
-    try:
-        return Server(subject, port)
-    except OSError as error:
-        raise UserError(f"port: expected a free port, got {port} ({error.strerror}). Try: port=0") from error
-
-
-def _hint(port: int) -> str:
-    """Return how to reach the page from another machine, and how to end the server."""
-    tunnel = f"ssh -L {port}:{HOST}:{port} {socket.gethostname()}"
-    return f"Ctrl-C ends the server. To open the address on another machine, first type there: {tunnel}"
+        return ShownFile(file, pack(read_gaussians(file, up=cfg.ply_up)))
+    run = ShownRun(find_run(str(cfg.run)))
+    if run.picture() is None and not is_held(run.place / LOCK):
+        # This raises the error that explains why there is no picture.
+        read_gaussians(find_asset(run.place))
+    return run

@@ -6,19 +6,20 @@ while it is open. A stranger may have written the folder: no link in it is follo
 
 import re
 import threading
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Generic, TypeVar
+from typing import Any, BinaryIO
 
+from cadam3d.core.chart import Chart
 from cadam3d.core.errors import UserError
-from cadam3d.core.gaussians import Gaussians
 from cadam3d.io import live
-from cadam3d.io.declarations import read_declarations
-from cadam3d.io.jsonl import is_whole
+from cadam3d.io.asset_file import read_gaussians
+from cadam3d.io.declarations import GAUSSIANS, LOSS, read_declarations
+from cadam3d.io.jsonl import is_number, is_whole
 from cadam3d.io.lock import holder_name, is_held
-from cadam3d.io.reading import open_contained, open_regular, signature
+from cadam3d.io.reading import open_contained, signature
 from cadam3d.io.records import psnr_of, read_config, read_metrics, read_summary
 from cadam3d.io.run_folder import (
     ASSET,
@@ -37,48 +38,16 @@ from cadam3d.io.run_folder import (
     setting_word,
     shown,
 )
-from cadam3d.live.curves import curves_of, drawn
 from cadam3d.viewer.pack import pack
 
 LARGEST_SNAPSHOT = 1 << 30  # bytes; ten million Gaussians of SH degree 3 have less
 MOST_SAVED = 100  # files that a page lists
+MOST_SENT = 500  # points of a curve
 CURVES = ("num_gaussians", "seconds", "loss")  # entries of both the log and the live state
 # Files of a run that the page, or the report, offers under their own names.
 OFFERED = (ASSET, CONFIG, METRICS, PREVIEW, SUMMARY, TURNTABLE)
 
-Version = tuple[int, int, int, int]
-Value = TypeVar("Value")
-
-
-@dataclass
-class Kept(Generic[Value]):
-    """A value that is computed from a file, and again only if the file has changed."""
-
-    open: Callable[[], BinaryIO]
-    read: Callable[[], Value]
-    _version: Version | None = field(default=None, init=False)
-    _value: Value | None = field(default=None, init=False)
-
-    def version(self) -> Version | None:
-        """Return what identifies the content of the file; None if it cannot be opened."""
-        return version_of(self.open)
-
-    def get(self) -> Value | None:
-        """Return the value; None if the file cannot be read."""
-        version = self.version()
-        if version is None:
-            return None
-        if version != self._version:
-            try:
-                self._value = self.read()
-            except UserError:
-                self._value = None
-            self._version = version
-        return self._value
-
-    def load(self) -> None:
-        """Compute the value now. Raises ``UserError`` if the file cannot be read."""
-        self._value, self._version = self.read(), self.version()
+Points = list[tuple[int, float]]  # steps, ascending, and values
 
 
 @dataclass
@@ -89,24 +58,16 @@ class ShownFile:
     """
 
     place: Path  # the file, or the folder of the run
-    read: Callable[[], Gaussians]  # raises UserError if the Gaussians cannot be read
+    packed: bytes | None = None  # the Gaussians of the file
     turns: threading.Lock = field(default_factory=threading.Lock, init=False)
-
-    def __post_init__(self) -> None:
-        self._packed = Kept(lambda: open_regular(self.place), lambda: pack(self.read()))
-
-    def load(self) -> None:
-        """Read the Gaussians now. Raises ``UserError`` if there are none that can be read."""
-        self._packed.load()
 
     def state(self) -> dict[str, Any]:
         """Return what the page shows beside the picture, as plain data."""
-        picture = _name(self._packed.version())
-        return {"kind": "file", "status": "idle", "title": self.place.name, "picture": picture}
+        return {"kind": "file", "status": "idle", "title": self.place.name, "picture": "file"}
 
     def picture(self) -> bytes | None:
         """Return the packed Gaussians; None if there are none."""
-        return self._packed.get()
+        return self.packed
 
     def charts(self) -> list[dict[str, Any]]:
         """Return the charts of the page, as plain data."""
@@ -125,22 +86,14 @@ class ShownFile:
 class ShownRun(ShownFile):
     """A run. It is live if a process holds the lock of its folder and has written the state in ``live/``."""
 
-    def __post_init__(self) -> None:
-        self._packed = Kept(partial(self._open, ASSET), lambda: pack(self.read()))
-        self._curves = Kept(partial(self._open, METRICS), lambda: curves_of(read_metrics(self.place)))
-        self._summary = Kept(partial(self._open, SUMMARY), lambda: read_summary(self.place))
-        self._config = Kept(partial(self._open, CONFIG), lambda: read_config(self.place / CONFIG))
-        self._declared = Kept(partial(self._open, CHARTS), lambda: read_declarations(self.place))
-
-    def load(self) -> None:
-        """Read the asset now, unless there is something else to show. Raises ``UserError``."""
-        if not is_held(self.place / LOCK) and self._version(LIVE_SNAPSHOT) is None:
-            self._packed.load()
+    # The version of each file that was read, and what was made of it.
+    _kept: dict[str, tuple[str, Any]] = field(default_factory=dict, init=False)
 
     def state(self) -> dict[str, Any]:
         """Return what the page shows beside the picture, and tell the run that a page is open."""
         is_writable = live.touch_watched(self.place)
-        config, now, curves = self._config.get() or {}, self._live(), self._curves.get() or {}
+        config = self._keep(CONFIG, lambda: read_config(self.place / CONFIG)) or {}
+        now, curves = self._live(), self._curves()
         title, total = config.get("prompt"), config.get("steps")
         log = {key: curves[key][-1][1] if curves.get(key) else None for key in CURVES}
         log["step"] = max((points[-1][0] for points in curves.values() if points), default=0)
@@ -148,8 +101,8 @@ class ShownRun(ShownFile):
             "kind": "run",
             "title": title if isinstance(title, str) else self.place.name,
             "resume": f"cadam3d train {setting_word('resume', shown(self.place))}",
-            "picture": _name(self._version(LIVE_SNAPSHOT if self._shows_snapshot(now) else ASSET)),
-            "charts": f"{_name(self._curves.version())} {_name(self._declared.version())}",
+            "picture": self._version(LIVE_SNAPSHOT if self._shows_snapshot(now) else ASSET),
+            "charts": f"{self._version(METRICS)} {self._version(CHARTS)}",
             "saved": self._saved(),
             "has_asset": self._version(ASSET) is not None,
             "has_report": self._version(REPORT) is not None,
@@ -164,7 +117,7 @@ class ShownRun(ShownFile):
         facts |= log
         if is_held(self.place / LOCK):
             return facts | {"status": "busy"}
-        summary = self._summary.get() or {}
+        summary = self._keep(SUMMARY, lambda: read_summary(self.place)) or {}
         done = {key: summary.get(key) for key in ("num_gaussians", "seconds", "outcome")}
         done |= {"step": summary.get("steps"), "psnr": psnr_of(summary)}
         known = {key: value for key, value in done.items() if value is not None}
@@ -173,16 +126,16 @@ class ShownRun(ShownFile):
     def picture(self) -> bytes | None:
         """Return the snapshot of a run that trains, else the packed asset; None if there is none."""
         if not self._shows_snapshot(self._live()):
-            return self._packed.get()
+            return self._keep(ASSET, lambda: pack(read_gaussians(self.place / ASSET)))
         try:
-            with self._open(LIVE_SNAPSHOT) as file:
+            with open_contained(self.place, LIVE_SNAPSHOT) as file:
                 return file.read(LARGEST_SNAPSHOT)
         except (OSError, UserError):
             return None
 
     def charts(self) -> list[dict[str, Any]]:
         """Return the curves of the run, as it has declared them."""
-        return drawn(self._curves.get() or {}, self._declared.get() or ())
+        return drawn(self._curves(), self._keep(CHARTS, lambda: read_declarations(self.place)) or ())
 
     def ask(self, request: str, process: str) -> bool:
         """Pass a request on, unless another process has taken the place of ``process``."""
@@ -200,7 +153,7 @@ class ShownRun(ShownFile):
         if step is not None:
             files[name] = f"{SAVED}/{saved_name(int(step.group(1)))}"
         try:
-            return self._open(files[name]) if name in files else None
+            return open_contained(self.place, files[name]) if name in files else None
         except (OSError, UserError):
             return None
 
@@ -225,21 +178,58 @@ class ShownRun(ShownFile):
         steps = [int(found.group(1)) for name in names if (found := re.fullmatch(SAVED_PATTERN, name))]
         return sorted(steps)[-MOST_SAVED:]
 
-    def _open(self, name: str) -> BinaryIO:
-        return open_contained(self.place, name)
+    def _curves(self) -> dict[str, Points]:
+        return self._keep(METRICS, lambda: curves_of(read_metrics(self.place))) or {}
 
-    def _version(self, name: str) -> Version | None:
-        return version_of(partial(self._open, name))
+    def _keep(self, name: str, read: Callable[[], Any]) -> Any:
+        """Return what ``read`` makes of a file, which is read again if it changes; None if that fails."""
+        version = self._version(name)
+        if version is None:
+            return None
+        if name not in self._kept or self._kept[name][0] != version:
+            try:
+                self._kept[name] = version, read()
+            except UserError:
+                self._kept[name] = version, None
+        return self._kept[name][1]
+
+    def _version(self, name: str) -> str | None:
+        """Return what identifies the content of a file; None if it cannot be opened."""
+        try:
+            with open_contained(self.place, name) as file:
+                return "-".join(map(str, signature(file)))
+        except (OSError, UserError, ValueError):
+            return None
 
 
-def version_of(opener: Callable[[], BinaryIO]) -> Version | None:
-    """Return what identifies the content of a file; None if it cannot be opened."""
-    try:
-        with opener() as file:
-            return signature(file)
-    except (OSError, UserError, ValueError):
-        return None
+def curves_of(lines: Iterable[Mapping[str, Any]]) -> dict[str, Points]:
+    """Return the points of every number in the lines of a log."""
+    found: dict[str, Points] = defaultdict(list)
+    for line in lines:
+        values = {**line, **line.get("statistics", {})}
+        if line["kind"] == "refine":
+            values = {**line.get("statistics", {}), "num_gaussians": line.get("after")}
+        for key, value in values.items():
+            # A step counts the Gaussians before its refinement, whose line comes first.
+            is_later = not found[key] or found[key][-1][0] < line["step"]
+            if is_number(value) and is_later:
+                found[key].append((line["step"], value))
+    return found
 
 
-def _name(version: Version | None) -> str | None:
-    return None if version is None else "-".join(map(str, version))
+def drawn(curves: Mapping[str, Points], charts: Sequence[Chart]) -> list[dict[str, Any]]:
+    """Return the common charts and ``charts``, with their numbers so far, as plain data."""
+
+    def sent(key: str) -> Points:
+        points = curves.get(key, [])
+        every = -(-len(points) // MOST_SENT) or 1
+        return points[:-1:every] + points[-1:]
+
+    return [
+        {
+            **{name: getattr(chart, name) for name in ("title", "caption", "log_y", "percent", "band_label")},
+            "band": [{"key": key, "points": sent(key)} for key in chart.band or ()],
+            "curves": [{**vars(curve), "points": sent(curve.key)} for curve in chart.curves],
+        }
+        for chart in (GAUSSIANS, LOSS, *charts)
+    ]

@@ -1,4 +1,4 @@
-"""``cadam3d view`` as its users see it: two processes, one folder, and a browser or HTTP between them."""
+"""``cadam3d view`` as its users see it: a process that trains, and a browser or HTTP before its page."""
 
 import http.client
 import json
@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +20,8 @@ from chromium import headless
 from splats import make_gaussians
 
 from cadam3d.io.ply import read_ply, write_ply
+from cadam3d.live.server import Server
+from cadam3d.live.subject import ShownRun
 
 PYTHON = (sys.executable, "-m", "cadam3d")
 SMALL = ("prompt=a red cube", "prior=tiny", "rasterizer=reference", "camera.size=8", "views=1")
@@ -67,11 +70,8 @@ def until(is_done: Callable[[], object]) -> None:
 class Page:
     """Does what the page does, without a browser."""
 
-    def __init__(self, viewer: subprocess.Popen) -> None:
-        assert viewer.stdout is not None
-        self.address = viewer.stdout.readline().strip()
-        self.hint = viewer.stdout.readline().strip()
-        self.url = urlsplit(self.address)
+    def __init__(self, address: str) -> None:
+        self.url = urlsplit(address)
 
     def ask(self, name: str, body: str | None = None) -> tuple[int, bytes]:
         connection = http.client.HTTPConnection(self.url.netloc, timeout=PATIENCE)
@@ -93,14 +93,25 @@ class Page:
         return self.ask("picture")[1]
 
 
+@contextmanager
+def viewed(folder: Path) -> Iterator[str]:
+    """Serve the page of a run from this process, and return its address."""
+    with Server(ShownRun(folder), 0) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)
+        thread.start()
+        try:
+            yield server.address
+        finally:
+            server.shutdown()
+            thread.join()
+
+
 @pytest.mark.slow
 def test_a_run_that_trains_is_shown_paused_resumed_saved_and_stopped(tmp_path):
     with process(tmp_path, "train", *SMALL, f"steps={ENDLESS}") as training:
         until((tmp_path / "run/live/state.json").exists)
-        with process(tmp_path, "view", "run=run", "open=false") as viewer:
-            page = Page(viewer)
-            assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]+/", page.address)
-            assert f"ssh -L {page.url.port}:127.0.0.1:{page.url.port} " in page.hint
+        with viewed(tmp_path / "run") as address:
+            page = Page(address)
             until(lambda: page.state["picture"])
             first = page.picture()
             until(lambda: page.state["picture"] and page.picture() != first)
@@ -123,9 +134,6 @@ def test_a_run_that_trains_is_shown_paused_resumed_saved_and_stopped(tmp_path):
             state = page.state
             assert (state["status"], state["outcome"]) == ("idle", "interrupted")
             assert page.picture() != first
-            viewer.send_signal(signal.SIGINT)
-            assert viewer.wait(PATIENCE) == 0
-            assert "Traceback" not in (tmp_path / "view.err").read_text()
     messages = (tmp_path / "train.err").read_text()
     assert "rm run/live/pause" in messages
     assert not (tmp_path / "run/live").exists()
@@ -133,10 +141,14 @@ def test_a_run_that_trains_is_shown_paused_resumed_saved_and_stopped(tmp_path):
 
 def test_a_single_file_is_served_and_a_port_that_is_in_use_is_named(tmp_path, type_line, monkeypatch):
     write_ply(tmp_path / "thing.ply", make_gaussians(5), up="-y", pad_sh=0)
-    monkeypatch.setattr("cadam3d.live.server.Server.serve_forever", lambda self: None)
+    # Ctrl-C ends the server without an error.
+    monkeypatch.setattr(
+        "cadam3d.live.server.Server.serve_forever", lambda self: signal.raise_signal(signal.SIGINT)
+    )
     code, out, err = type_line("view", "ply=thing.ply", "open=false")
     assert (code, err) == (0, "")
     assert re.match(r"http://127\.0\.0\.1:\d+/[\w-]{20,}/\nCtrl-C ends the server\.", out)
+    assert re.search(r"ssh -L (\d+):127\.0\.0\.1:\1 ", out)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         message = type_line("view", "ply=thing.ply", "open=false", f"port={port}").message
@@ -164,8 +176,8 @@ def test_the_page_in_a_browser_follows_the_run_and_its_buttons_work(tmp_path, br
     browser.on("pageerror", lambda error: problems.append(str(error)))
     with process(tmp_path, "train", *SMALL, f"steps={ENDLESS}") as training:
         until((tmp_path / "run/live/state.json").exists)
-        with process(tmp_path, "view", "run=run", "open=false") as viewer:
-            browser.goto(Page(viewer).address)
+        with viewed(tmp_path / "run") as address:
+            browser.goto(address)
             browser.wait_for_selector("#charts figure:nth-of-type(3)", timeout=60_000)
             browser.wait_for_selector("#controls option[value=age]", state="attached", timeout=60_000)
             canvas = browser.locator("#view canvas")
@@ -189,5 +201,4 @@ def test_the_page_in_a_browser_follows_the_run_and_its_buttons_work(tmp_path, br
             browser.wait_for_selector("text=not running", timeout=60_000)
             assert browser.is_disabled("#pause")
             assert not problems
-            viewer.kill()
-            browser.wait_for_selector("text=The connection is lost", timeout=60_000)
+        browser.wait_for_selector("text=The connection is lost", timeout=60_000)

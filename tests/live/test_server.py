@@ -108,7 +108,7 @@ class Browser:
 
 @pytest.fixture
 def browser(run) -> Iterator[Browser]:
-    with serving(ShownRun(run, lambda: read_ply(run / "asset.ply"))) as browser:
+    with serving(ShownRun(run)) as browser:
         yield browser
 
 
@@ -186,7 +186,7 @@ def test_a_report_is_in_a_sandbox(browser):
 
 def test_a_single_file_is_shown_without_anything_of_a_run(run):
     file = run / "asset.ply"
-    with serving(ShownFile(file, lambda: read_ply(file))) as browser:
+    with serving(ShownFile(file, pack(read_ply(file)))) as browser:
         state = browser.json("state")
         assert (state["kind"], state["title"]) == ("file", "asset.ply")
         assert browser.get("picture")[2] == pack(read_ply(file))
@@ -233,8 +233,8 @@ def test_a_request_for_another_process_is_refused(browser, run):
 
 
 def test_two_pages_work_at_once(run):
-    subject = ShownRun(run, lambda: read_ply(run / "asset.ply"))
-    with training(run), serving(subject) as one, serving(ShownRun(run, subject.read)) as other:
+    subject = ShownRun(run)
+    with training(run), serving(subject) as one, serving(ShownRun(run)) as other:
         process = one.json("state")["process"].encode()
         assert one.post("pause", process) == other.post("pause", process) == 200
         assert other.post("resume", process) == one.post("resume", process) == 200
@@ -311,7 +311,7 @@ def test_a_link_in_place_of_the_live_folder_is_not_written_into(browser, run, tm
 
 
 def test_the_address_is_on_loopback_and_has_a_new_token_each_time(run):
-    with Server(ShownFile(run, lambda: make_gaussians(1)), 0) as one:
+    with Server(ShownFile(run), 0) as one:
         assert one.server_address[0] == "127.0.0.1"
         assert one.address == f"http://127.0.0.1:{one.server_port}/{one.token}/"
         with Server(one.subject, 0) as other:
