@@ -56,14 +56,8 @@ class Shot:
 class Losses:
     """The loss of a step: what the prior wants, and the penalties of the regularizers."""
 
-    guidance: Tensor  # one number
-    penalties: Mapping[str, Tensor]
+    total: Tensor  # one number
     log: Mapping[str, Tensor | float]  # of the guidance and the regularizers
-
-    @property
-    def total(self) -> Tensor:
-        """Return the sum of all."""
-        return sum(self.penalties.values(), start=self.guidance)
 
 
 @dataclass(frozen=True)
@@ -142,23 +136,13 @@ class Trainer:
             name: penalty(shot.gaussians, shot.output, state.step)
             for name, penalty in self.regularizers.items()
         }
-        return Losses(guided.loss, penalties, {**guided.log, **penalties})
+        return Losses(sum(penalties.values(), start=guided.loss), {**guided.log, **penalties})
 
     def _backward(self, state: TrainState, shot: Shot, losses: Losses) -> GradientSignal:
-        """Differentiate the loss, and return the gradients for the densifier.
-
-        A densifier that ignores the penalties reads the gradients before these are added. If a penalty
-        depends on the images, each pass differentiates the rasterizer, and one pass could not do both: the
-        densifier needs the gradients of one loss, and the optimizer the gradients of another.
-        """
+        """Differentiate the loss, and return the gradients for the densifier."""
         state.optimizer.zero_grad()
-        if not (losses.penalties and self.densifier.guidance_only):
-            losses.total.backward()
-            return GradientSignal.read(state.gaussians, shot.output)
-        losses.guidance.backward(retain_graph=True)
-        signal = GradientSignal.read(state.gaussians, shot.output).copy()
-        torch.stack(list(losses.penalties.values())).sum().backward()
-        return signal
+        losses.total.backward()
+        return GradientSignal.read(state.gaussians, shot.output)
 
     def _observe(self, state: TrainState, shot: Shot, losses: Losses, signal: GradientSignal) -> Evidence:
         """Let the densifier observe the gradients, and read every number that the host needs.
@@ -223,7 +207,7 @@ class Trainer:
             plan = RefinePlan(is_selected=plan.is_selected)
         if plan.edit is not None:
             # The state changes last: if memory runs out before, all owners still have the old rows.
-            carried = self.densifier.carry(seen, plan.edit)
+            carried = seen.carry(plan.edit)
             state.optimizer.apply(plan.edit)
             state.densifier = carried
 
@@ -231,7 +215,6 @@ class Trainer:
         if resets and not state.refused:
             unreliable = self.densifier.unreliable(state.densifier)
             reset = state.optimizer.reset_opacity(unreliable, self.refine.reset_value)
-            state.densifier = self.densifier.after_reset(state.densifier, unreliable)
 
         return RefineReport(
             step=step,

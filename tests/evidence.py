@@ -23,18 +23,11 @@ PAPER = {
     "reset_min_age": 0,
 }
 OPEN = {
-    "grad_source": "total",
     "grad_norm": "none",
     "invisible": "zero",
-    "nonfinite": "skip_step",
-    "quantile_over": "all",
     "tau_m": None,
     "alpha": None,
-    "eps_mode": "abs",
-    "child_state": "zero",
-    "parent_state": "keep",
     "tau_reset": None,
-    "reset_moments": False,
 }
 
 

@@ -364,7 +364,7 @@ def test_running_out_of_memory_is_an_outcome(tmp_path, error, monkeypatch):
     assert state.step == 0
 
 
-@pytest.mark.parametrize("where", ["cadam3d.densifier.cadam.CAdam.carry", "cadam3d.core.edit.RowEdit.apply"])
+@pytest.mark.parametrize("where", ["cadam3d.core.edit.RowState.carry", "cadam3d.core.edit.RowEdit.apply"])
 def test_owners_of_rows_agree_even_if_memory_runs_out_within_a_refinement(tmp_path, monkeypatch, where):
     trainer, state = make()
 

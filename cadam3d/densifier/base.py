@@ -1,7 +1,7 @@
 """Densifier: decides WHEN a Gaussian grows. HOW (clone, split, prune) is shared, see refine.py (sec. 4.4)."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import torch
@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cadam3d.core.chart import Chart
-from cadam3d.core.edit import RowEdit, RowState
+from cadam3d.core.edit import RowState
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderOutput
 from cadam3d.densifier.refine import Refine, RefinePlan
@@ -44,11 +44,6 @@ class GradientSignal:
             absgrad=None if output.absgrad is None else _gradient_of(output.absgrad),
         )
 
-    def copy(self) -> "GradientSignal":
-        """Return gradients that no later backward pass changes."""
-        absgrad = None if self.absgrad is None else self.absgrad.clone()
-        return replace(self, means2d=self.means2d.clone(), absgrad=absgrad)
-
     @property
     def visible(self) -> Bool[Tensor, "v n"]:
         """Return the mask of Gaussians that touched each view."""
@@ -75,11 +70,6 @@ class Densifier(ABC, Generic[State]):
     Working in place could save CAdam only a part of 4 ms per million Gaussians on one core, where the
     cheapest step takes 340 ms (``docs/method.md``).
     """
-
-    @property
-    def guidance_only(self) -> bool:
-        """Return whether signals leave the regularizers out, which may take a second backward pass."""
-        return False
 
     @property
     def needs_absgrad(self) -> bool:
@@ -141,10 +131,6 @@ class Densifier(ABC, Generic[State]):
         assert selected.shape == (len(gaussians),), "select returns a mask with one row per Gaussian"
         return refine.plan(gaussians, selected, step, generator, self.unwanted(state))
 
-    def after_reset(self, state: State, rows: Bool[Tensor, "n"]) -> State:
-        """Return the state after an opacity reset of ``rows``; by default the same state."""
-        return state
-
     def perturb(
         self, gaussians: Gaussians, lr: float, generator: torch.Generator
     ) -> Float[Tensor, "n 3"] | None:
@@ -154,10 +140,6 @@ class Densifier(ABC, Generic[State]):
         ``generator`` is on the CPU, and nothing else draws from it.
         """
         return None
-
-    def carry(self, state: State, edit: RowEdit) -> State:
-        """Return the state after a refinement; by default survivors keep it and newborns get zeros."""
-        return state.carry(edit)
 
     def scores(self, state: State) -> dict[str, Float[Tensor, "n"]]:
         """Return numbers per Gaussian, such as the SNR, for pictures and histograms only."""

@@ -34,8 +34,6 @@ SMALL = [
     "refine.recovery=1",
     "callback=[]",
 ]
-GUIDANCE = ["densifier=cadam_open", "densifier.grad_source=guidance"]
-REGULARIZED = ["regularizer=[mean_scale,total_variation]", "regularizer.total_variation.weight=50"]
 
 
 @dataclass
@@ -61,21 +59,6 @@ def run(overrides: Sequence[str], folder: Path) -> tuple[TrainState, Recorder, O
     )
     outcome = trainer.train(state, trainer.prior.embed(cfg.prompt, ""), context)
     return state, recorder, outcome
-
-
-# The signal.
-
-
-def test_the_guidance_alone_is_observed_on_request_while_the_optimizer_follows_the_whole_loss(tmp_path):
-    once = ["steps=1"]
-    bare, _, _ = run(once, tmp_path)
-    total, _, _ = run([*once, *REGULARIZED], tmp_path)
-    guided, _, _ = run([*once, *REGULARIZED, *GUIDANCE], tmp_path)
-    assert torch.equal(guided.densifier.m, bare.densifier.m)
-    assert not torch.allclose(total.densifier.m, bare.densifier.m, rtol=0.01)
-    for kind in ("exp_avg", "exp_avg_sq"):
-        whole, split = (each.optimizer.state_dict()[kind]["means"] for each in (total, guided))
-        torch.testing.assert_close(split, whole, rtol=1e-3, atol=1e-4 * float(whole.norm()))
 
 
 # The report that callbacks see.

@@ -229,7 +229,7 @@ def test_selections_counts_and_resets_are_those_of_densifier_cadam_on_the_same_g
         if refine.refines_at(step):
             before = gaussians_of(params).map(lambda tensor: tensor.detach().clone())
             plan = densifier.plan(state, before, step, refine, DRAWS)
-            state = densifier.carry(state, plan.edit)
+            state = state.carry(plan.edit)
             totals.update({name: totals[name] + getattr(plan, name) for name in totals if name != "reset"})
         recorder = Recorder(monkeypatch)
         opacities = {}

@@ -196,7 +196,7 @@ def test_selections_counts_and_resets_are_those_of_densifier_cadam(model_class):
         state = densifier.observe(state, signal(gradient))
         if iteration % 10 == 0:
             plan = densifier.plan(state, before, iteration, refine, DRAWS)
-            state = densifier.carry(state, plan.edit)
+            state = state.carry(plan.edit)
             unreliable = densifier.unreliable(state)
             is_low = model._opacity[:, 0].sigmoid() <= 0.0101
             assert len(model._xyz) == plan.edit.rows_after
