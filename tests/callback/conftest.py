@@ -46,6 +46,12 @@ def train(begin):
 
 
 @pytest.fixture(scope="session")
+def plain(train, tmp_path_factory):
+    """Return the state of a run that no callback watches."""
+    return train(tmp_path_factory.mktemp("plain"), "densifier.min_age=0")[0]
+
+
+@pytest.fixture(scope="session")
 def alike():
     """Return a function that checks that two runs have the same Gaussians, statistics and random states."""
 

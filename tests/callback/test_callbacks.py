@@ -44,6 +44,9 @@ def test_after_running_out_of_memory_the_last_checkpoint_stays(train, tmp_path, 
 
 
 def test_metrics_have_one_line_per_logged_step_and_per_refinement(train, tmp_path):
+    """Lines of steps that will be repeated are deleted."""
+    for step in (1, 2, 3):
+        append_jsonl(tmp_path / "metrics.jsonl", {"kind": "step", "step": step, "old": True})
     train(tmp_path, "refine.interval=3", callbacks=[Metrics(every=3)])
     lines = read_jsonl(tmp_path / "metrics.jsonl")
     assert [(line["kind"], line["step"]) for line in lines] == [
@@ -66,12 +69,3 @@ def test_metrics_have_one_line_per_logged_step_and_per_refinement(train, tmp_pat
         "statistics",
     } <= refinement.keys()
     assert {"loss", "num_gaussians", "seconds"} <= lines[0].keys()
-
-
-def test_lines_of_steps_that_will_be_repeated_are_deleted(train, tmp_path):
-    for step in (1, 2, 3):
-        append_jsonl(tmp_path / "metrics.jsonl", {"kind": "step", "step": step, "old": True})
-    train(tmp_path, "steps=2", "refine.interval=3", callbacks=[Metrics(every=1)])
-    lines = read_jsonl(tmp_path / "metrics.jsonl")
-    assert not any(line.get("old") for line in lines)
-    assert [line["step"] for line in lines] == [1, 2]

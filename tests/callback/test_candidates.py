@@ -16,29 +16,23 @@ LINE = (
     *("densifier.min_age=0", "callback=[candidates]", "callback.candidates.every=4"),
     *("callback.candidates.size=16", "callback.candidates.azimuths_deg=[30,210]"),
 )
-CALLBACK = {
-    "every": 4,
-    "azimuths_deg": [30.0],
-    "elevation_deg": 20.0,
-    "distance": 3.0,
-    "fov_y_deg": 40.0,
-    "size": 16,
-    "background": [1.0, 1.0, 1.0],
-    "bins_per_decade": 10,
-}
 
 
 @pytest.fixture(scope="module")
 def watched(train, tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
+    (folder / "candidates").mkdir()
+    (folder / "candidates/step_000099.png").write_bytes(b"old")
+    append_jsonl(folder / "candidates/histograms.jsonl", {"step": 99, "score": "old"})
     return folder, train(folder, *LINE)[0]
 
 
-def test_a_run_with_the_callback_equals_one_without(watched, train, alike, tmp_path):
-    alike(watched[1], train(tmp_path, "densifier.min_age=0")[0])
+def test_a_run_with_the_callback_equals_one_without(watched, plain, alike):
+    alike(watched[1], plain)
 
 
 def test_pictures_come_at_multiples_and_histograms_at_every_refinement(watched):
+    """What a killed run wrote after its last checkpoint is deleted."""
     assert [step for step, _ in step_pictures(watched[0] / "candidates")] == [4]
     lines = read_jsonl(watched[0] / "candidates/histograms.jsonl")
     assert {line["step"] for line in lines} == {2, 4, 6}
@@ -56,16 +50,6 @@ def test_every_histogram_counts_the_whole_population(watched):
         assert all(s <= n for s, n in zip(line["selected"], line["counts"], strict=True))
     first = [line for line in lines if line["step"] == 2]
     assert {sum(line["counts"]) + line["without_log"] for line in first} == {watched[1].num_initial}
-
-
-def test_files_of_a_killed_run_after_its_checkpoint_are_deleted(train, tmp_path):
-    folder = tmp_path / "candidates"
-    folder.mkdir()
-    (folder / "step_000099.png").write_bytes(b"old")
-    append_jsonl(folder / "histograms.jsonl", {"step": 99, "score": "old"})
-    train(tmp_path, *LINE)
-    assert 99 not in [step for step, _ in step_pictures(folder)]
-    assert "old" not in {line["score"] for line in read_jsonl(folder / "histograms.jsonl")}
 
 
 def test_selected_gaussians_are_drawn_in_one_colour_and_the_others_in_another():

@@ -48,7 +48,7 @@ class Page(Callback):
             os.utime(self.folder / "live/watched", (step, step))
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def watch(train):
     """Return a function that trains a few steps, with an open page or without, and returns state and page."""
 
@@ -62,54 +62,60 @@ def watch(train):
     return run
 
 
-def test_the_run_is_the_same_with_and_without_live_and_with_an_open_page(watch, tmp_path):
-    states = [
-        watch(tmp_path / name, with_live=name != "off", is_open=name == "open")[0]
-        for name in ("off", "closed", "open")
-        if (tmp_path / name).mkdir() is None
-    ]
-    for other in states[1:]:
-        assert torch.equal(other.gaussians.means, states[0].gaussians.means)
-        assert torch.equal(other.gaussians.sh, states[0].gaussians.sh)
+@pytest.fixture(scope="module")
+def opened(watch, tmp_path_factory):
+    """Return the folder of a run with an open page, its state and the page."""
+    folder = tmp_path_factory.mktemp("opened")
+    return folder, *watch(folder)
+
+
+@pytest.fixture(scope="module")
+def closed(watch, tmp_path_factory):
+    """Return the same of a run without an open page."""
+    folder = tmp_path_factory.mktemp("closed")
+    return folder, *watch(folder, is_open=False)
+
+
+def test_the_run_is_the_same_with_and_without_live_and_with_an_open_page(watch, opened, closed, tmp_path):
+    off, _ = watch(tmp_path, with_live=False)
+    for other in (opened[1], closed[1]):
+        assert torch.equal(other.gaussians.means, off.gaussians.means)
+        assert torch.equal(other.gaussians.sh, off.gaussians.sh)
         for name, generator in other.generators.items():
-            assert torch.equal(generator.get_state(), states[0].generators[name].get_state())
+            assert torch.equal(generator.get_state(), off.generators[name].get_state())
 
 
-def test_without_a_page_no_snapshot_is_written(watch, tmp_path):
-    _, page = watch(tmp_path, is_open=False)
+def test_without_a_page_no_snapshot_is_written(closed):
+    folder, _, page = closed
     assert page.snapshots == [None] * STEPS
-    assert sorted(path.name for path in (tmp_path / "live").iterdir()) == ["state.json"]
+    assert sorted(path.name for path in (folder / "live").iterdir()) == ["state.json"]
 
 
-def test_an_open_page_gets_snapshots_that_change_with_the_layers_of_the_densifier(watch, tmp_path):
-    state, page = watch(tmp_path)
+def test_an_open_page_gets_snapshots_that_change_with_the_layers_of_the_densifier(opened):
+    _, state, page = opened
     assert len(set(page.snapshots)) > STEPS // 2
     assert struct.unpack_from("<I", page.snapshots[-1], 12) == (len(state.gaussians),)
     for layer in (b"snr", b"drift", b"age", b"selected"):
         assert layer in page.snapshots[-1]
 
 
-def test_age_counts_the_steps_since_the_birth_of_each_row(watch, tmp_path):
-    _, page = watch(tmp_path, "densifier=random")
+def test_the_rows_know_their_age_and_the_children_and_surviving_parents_are_selected(watch, tmp_path):
+    # The scale above which a parent is replaced is so large that each one survives.
+    _, page = watch(tmp_path, "densifier=random", "refine.tau_scale=100")
     for step, born, selected, n in page.rows:
         assert len(born) == len(selected) == n
         # Newborns are the last rows, and no row is older than the run.
         assert born.equal(born.sort().values)
         assert set(born.tolist()) <= {0, *range(4, step + 1, 4)}
-    assert {0, 4, 8, 12} == set(page.rows[-1][1].tolist())
-
-
-def test_the_children_and_the_surviving_parents_of_the_last_refinement_are_selected(watch, tmp_path):
-    # The scale above which a parent is replaced is so large that each one survives.
-    _, page = watch(tmp_path, "densifier=random", "refine.tau_scale=100")
     _, born, selected, _ = page.rows[-1]
+    assert {0, 4, 8, 12} == set(born.tolist())
     assert selected[born == STEPS].all()
     assert int(selected.sum()) == 2 * int((born == STEPS).sum()) > 0
 
 
-def test_the_last_numbers_say_that_training_has_ended(watch, tmp_path):
-    state, _ = watch(tmp_path)
-    written = live.read_state(tmp_path)
+def test_the_last_numbers_say_that_training_has_ended(opened):
+    folder, state, _ = opened
+    written = live.read_state(folder)
     assert written is not None
     assert written["has_ended"]
     assert (written["step"], written["num_gaussians"]) == (STEPS, len(state.gaussians))
