@@ -61,7 +61,7 @@ def _check_types() -> None:
     names = [
         path.relative_to(package.parent).with_suffix("").parts
         for path in package.rglob("*.py")
-        if "from jaxtyping import" in path.read_text(encoding="utf-8")
+        if re.search("from jaxtyping import|import .*PerView", path.read_text(encoding="utf-8"))
     ]
     install_import_hook([".".join(parts).removesuffix(".__init__") for parts in names], "typechecker.check")
 

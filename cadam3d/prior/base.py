@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.rendering import Truth
-from cadam3d.prior.path import NoisePath, Prediction
+from cadam3d.prior.path import Latents, NoisePath, PerView, Prediction
 
 
 class Condition(ABC):
@@ -83,9 +83,7 @@ class DiffusionPrior(ABC):
         """
 
     @abstractmethod
-    def predict(
-        self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: Condition, scale: float
-    ) -> Prediction:
+    def predict(self, noisy: Latents, t: PerView, condition: Condition, scale: float) -> Prediction:
         """Predict under guidance, negative + scale * (positive - negative), without gradient.
 
         ``scale`` 1 uses the prompt alone, 0 the negative prompt alone (the empty one unless the user gave

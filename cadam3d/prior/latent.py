@@ -24,7 +24,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.cache import default_cache_dir
 from cadam3d.io.pretrained import DTYPES, VOCABULARY, ModelSource, Pretrained
 from cadam3d.prior.base import Condition, DiffusionPrior, MemoryEstimate, PromptEmbedding
-from cadam3d.prior.path import DDPM, NoisePath, Prediction, Rows
+from cadam3d.prior.path import DDPM, Latents, NoisePath, PerView, Prediction, Rows
 from cadam3d.prior.prompting import Mix, Prompting, guide
 from cadam3d.prior.shapes.lexicon import Lexicon
 from cadam3d.prior.texts import TextCache, Texts
@@ -130,24 +130,14 @@ class LatentPrior(DiffusionPrior):
         """Load the text encoders, embed ``texts``, and free the encoders."""
 
     @abstractmethod
-    def denoise(
-        self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras
-    ) -> Float[Tensor, "b c h w"]:
+    def denoise(self, noisy: Latents, timestep: PerView, texts: Texts, cameras: Cameras) -> Latents:
         """Return the raw output of :attr:`network`, in its dtype."""
 
     @abstractmethod
-    def complete(
-        self, noisy: Float[Tensor, "v c h w"], output: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
-    ) -> Prediction:
+    def complete(self, noisy: Latents, output: Latents, t: PerView) -> Prediction:
         """Convert the (guided) output of the network to a prediction in all three forms."""
 
-    def tempered(
-        self,
-        noisy: Float[Tensor, "v c h w"],
-        guided: Prediction,
-        output: Float[Tensor, "v c h w"],
-        t: Float[Tensor, "v"],
-    ) -> Prediction:
+    def tempered(self, noisy: Latents, guided: Prediction, output: Latents, t: PerView) -> Prediction:
         """Return ``guided``; a subclass may move it towards ``output``, the prediction without guidance."""
         return guided
 
@@ -185,9 +175,7 @@ class LatentPrior(DiffusionPrior):
         return (images.permute(0, 2, 3, 1) / 2 + 0.5).clamp(0, 1)
 
     @torch.no_grad()
-    def predict(
-        self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: TextCondition, scale: float
-    ) -> Prediction:
+    def predict(self, noisy: Latents, t: PerView, condition: TextCondition, scale: float) -> Prediction:
         """Predict under guidance, without gradient.
 
         All branches of guidance are in one batch, which ``micro_batch`` splits.
@@ -369,13 +357,7 @@ class LatentPrior(DiffusionPrior):
         mean = self.vae.encode((2 * images - 1).to(self.vae.dtype)).latent_dist.mode().float()
         return (mean - (config.shift_factor or 0)) * config.scaling_factor
 
-    def _outputs(
-        self,
-        noisy: Float[Tensor, "v c h w"],
-        t: Float[Tensor, "v"],
-        condition: TextCondition,
-        weights: Tensor,
-    ) -> Float[Tensor, "b c h w"]:
+    def _outputs(self, noisy: Latents, t: PerView, condition: TextCondition, weights: Tensor) -> Tensor:
         """Run the network on every row of ``weights``: all views, once for each branch of guidance."""
         copies = len(weights) // len(noisy)
         many = noisy.to(self.torch_dtype).repeat(copies, 1, 1, 1)

@@ -140,8 +140,9 @@ class SingleFile(LatentDiffusion):
     def _load_tokenizer(self) -> Any:
         from transformers import CLIPTokenizer
 
-        config, key, loaded = self.config("text_encoder"), f"{self.source.key}.tokenizer", None
+        config, key = self.config("text_encoder"), f"{self.source.key}.tokenizer"
         length, pieces = config["max_position_embeddings"], config["vocab_size"]
+        loaded: Any = None
         with suppress(OSError, ValueError):
             loaded = CLIPTokenizer.from_pretrained(self.tokenizer, model_max_length=length)
         # If the files are missing, transformers may silently make a tokenizer that knows no word.

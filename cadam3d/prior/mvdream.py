@@ -16,7 +16,7 @@ from cadam3d.io.pretrained import Pretrained
 from cadam3d.prior.base import MemoryEstimate
 from cadam3d.prior.latent import PRIORS, LatentEmbedding, TextCondition
 from cadam3d.prior.ldm import SingleFile, with_ldm_unet
-from cadam3d.prior.path import Prediction, per_view
+from cadam3d.prior.path import Latents, PerView, Prediction, per_view
 from cadam3d.prior.stable_diffusion import StableDiffusion
 from cadam3d.prior.texts import Texts
 
@@ -91,9 +91,7 @@ class MVDream(StableDiffusion):
         embedding = super().embed(prompt, negative)
         return MultiviewEmbedding(texts=embedding.texts, prompting=embedding.prompting)
 
-    def denoise(
-        self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras
-    ) -> Float[Tensor, "b c h w"]:
+    def denoise(self, noisy: Latents, timestep: PerView, texts: Texts, cameras: Cameras) -> Latents:
         """Run the UNet with text cross-attention; the cameras are added to the time input."""
         matrices = camera_numbers(cameras).to(noisy)
         return self.network(noisy, timestep, encoder_hidden_states=texts.tokens, class_labels=matrices).sample
@@ -104,9 +102,7 @@ class MVDream(StableDiffusion):
         vars(self)["checked"] = 0
 
     @torch.no_grad()
-    def predict(
-        self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: TextCondition, scale: float
-    ) -> Prediction:
+    def predict(self, noisy: Latents, t: PerView, condition: TextCondition, scale: float) -> Prediction:
         """Predict every view, without gradient. Raises ``UserError`` if ``t`` differs within a group."""
         checked = vars(self).get("checked", 0)
         if t.device.type == "cpu" or checked < CHECKED:
@@ -114,13 +110,7 @@ class MVDream(StableDiffusion):
             require_one_level(t)
         return super().predict(noisy, t, condition, scale)
 
-    def tempered(
-        self,
-        noisy: Float[Tensor, "v c h w"],
-        guided: Prediction,
-        output: Float[Tensor, "v c h w"],
-        t: Float[Tensor, "v"],
-    ) -> Prediction:
+    def tempered(self, noisy: Latents, guided: Prediction, output: Latents, t: PerView) -> Prediction:
         """Rescale the clean prediction towards its spread without guidance (MVDream, sec. 3.2)."""
         if self.rescale == 0:
             return guided
@@ -149,7 +139,7 @@ def camera_numbers(cameras: Cameras) -> Float[Tensor, "v 16"]:
     return torch.cat([torch.cat([axes, centres[..., None]], dim=2), last], dim=1).flatten(1)
 
 
-def require_one_level(t: Float[Tensor, "v"]) -> None:
+def require_one_level(t: PerView) -> None:
     """Raise ``UserError`` unless the views of each group have one noise level."""
     levels = t.view(-1, VIEWS)
     require(
@@ -214,7 +204,7 @@ def across_views(network: Any) -> Any:
     return network
 
 
-def _spread(clean: Float[Tensor, "v c h w"]) -> Float[Tensor, "v"]:
+def _spread(clean: Latents) -> PerView:
     """Return the standard deviation over a whole group, repeated for each of its views."""
     groups = clean.reshape(len(clean) // VIEWS, -1)
     return groups.std(dim=1).clamp_min(1e-8).repeat_interleave(VIEWS)

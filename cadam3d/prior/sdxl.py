@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.io.pretrained import Pretrained
 from cadam3d.prior.latent import FACTOR
+from cadam3d.prior.path import Latents, PerView
 from cadam3d.prior.stable_diffusion import StableDiffusion
 from cadam3d.prior.texts import Texts, penultimate
 
@@ -39,9 +38,7 @@ class StableDiffusionXL(StableDiffusion):
         pooled = None if both.pooled is None else both.pooled.index_fill(0, empty, 0)
         return Texts(both.tokens.index_fill(0, empty, 0), pooled)
 
-    def denoise(
-        self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras
-    ) -> Float[Tensor, "b c h w"]:
+    def denoise(self, noisy: Latents, timestep: PerView, texts: Texts, cameras: Cameras) -> Latents:
         """Run the UNet with text cross-attention; pooled text and image sizes are added to the time input."""
         height, width = (FACTOR * side for side in noisy.shape[2:])
         # The original size, the top left corner of the crop and the target size.

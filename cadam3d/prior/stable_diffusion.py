@@ -6,13 +6,11 @@ from functools import cached_property
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.io.pretrained import Pretrained
 from cadam3d.prior.latent import LatentPrior, completion, ddpm_path
-from cadam3d.prior.path import NoisePath, Prediction
+from cadam3d.prior.path import Latents, NoisePath, PerView, Prediction
 from cadam3d.prior.texts import Texts, tokenize
 
 
@@ -34,9 +32,7 @@ class StableDiffusion(LatentPrior):
         """Return the noise path of the model's scheduler."""
         return self.at_levels(ddpm_path(self.scheduler))
 
-    def complete(
-        self, noisy: Float[Tensor, "v c h w"], output: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
-    ) -> Prediction:
+    def complete(self, noisy: Latents, output: Latents, t: PerView) -> Prediction:
         """Complete the network's output; the scheduler defines whether it is the noise or the velocity."""
         return completion(self.noise_path, self.scheduler)(noisy, output, t)
 
@@ -47,8 +43,6 @@ class StableDiffusion(LatentPrior):
         encoder = found.part("text_encoder", self.torch_dtype).to(device)
         return Texts(encoder(tokens)[0], None)
 
-    def denoise(
-        self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras
-    ) -> Float[Tensor, "b c h w"]:
+    def denoise(self, noisy: Latents, timestep: PerView, texts: Texts, cameras: Cameras) -> Latents:
         """Run the UNet with text cross-attention."""
         return self.network(noisy, timestep, encoder_hidden_states=texts.tokens).sample

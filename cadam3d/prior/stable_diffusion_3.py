@@ -15,7 +15,7 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require, require_choice
 from cadam3d.io.pretrained import Pretrained
 from cadam3d.prior.latent import LatentPrior
-from cadam3d.prior.path import NoisePath, Prediction, RectifiedFlow
+from cadam3d.prior.path import Latents, NoisePath, PerView, Prediction, RectifiedFlow
 from cadam3d.prior.texts import T5_TOKENS, Texts, penultimate, tokenize
 
 T5 = "text_encoder_3"
@@ -65,9 +65,7 @@ class StableDiffusion3(LatentPrior):
         )
         return self.at_levels(RectifiedFlow(shift=float(self.scheduler.get("shift", 1.0))))
 
-    def complete(
-        self, noisy: Float[Tensor, "v c h w"], output: Float[Tensor, "v c h w"], t: Float[Tensor, "v"]
-    ) -> Prediction:
+    def complete(self, noisy: Latents, output: Latents, t: PerView) -> Prediction:
         """Complete the network's output, which is the velocity."""
         return self.noise_path.from_velocity(noisy, output, t)
 
@@ -85,9 +83,7 @@ class StableDiffusion3(LatentPrior):
         tokens = torch.cat([F.pad(both, (0, width - both.shape[-1])), long], dim=1)
         return Texts(tokens, torch.cat([each.pooled for each in clip if each.pooled is not None], dim=-1))
 
-    def denoise(
-        self, noisy: Float[Tensor, "b c h w"], timestep: Float[Tensor, "b"], texts: Texts, cameras: Cameras
-    ) -> Float[Tensor, "b c h w"]:
+    def denoise(self, noisy: Latents, timestep: PerView, texts: Texts, cameras: Cameras) -> Latents:
         """Run the transformer over image and text tokens together."""
         return self.network(
             hidden_states=noisy,

@@ -13,7 +13,7 @@ from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require_choice, require_whole
 from cadam3d.core.device import upload
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
-from cadam3d.prior.path import NoisePath, Prediction
+from cadam3d.prior.path import Latents, NoisePath, PerView, Prediction
 
 # The special tokens; 0 to 255 are the bytes of the prompt.
 START, PADDING = 256, 257
@@ -101,9 +101,7 @@ class Tiny(DiffusionPrior):
         return ((pixels.permute(0, 2, 3, 1) + 1) / 2).clamp(0, 1)
 
     @torch.no_grad()
-    def predict(
-        self, noisy: Float[Tensor, "v c lh lw"], t: Float[Tensor, "v"], condition: TinyCondition, scale: float
-    ) -> Prediction:
+    def predict(self, noisy: Latents, t: PerView, condition: TinyCondition, scale: float) -> Prediction:
         """Predict negative + scale * (positive - negative), without gradient, both halves in one batch."""
         prompts = [condition.positive] if scale == 1 else [condition.negative, condition.positive]
         copies = len(prompts)

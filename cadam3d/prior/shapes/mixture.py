@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.prior.path import per_view
+from cadam3d.prior.path import Latents, PerView, per_view
 
 # If a pixel is certain (sigma = 0) and has no noise (b = 0), the posterior is 0 / 0. This variance is too
 # small to be visible and gives the limit b -> 0, the nearest mode.
@@ -29,11 +29,9 @@ class Mixture:
 
     means: Float[Tensor, "v m c h w"]
     log_weights: Float[Tensor, "m"]
-    variance: Float[Tensor, "v c h w"]  # per pixel, shared by the modes
+    variance: Latents  # per pixel, shared by the modes
 
-    def denoise(
-        self, noisy: Float[Tensor, "v c h w"], a: Float[Tensor, "v"], b: Float[Tensor, "v"]
-    ) -> tuple[Float[Tensor, "v c h w"], Float[Tensor, "v c h w"]]:
+    def denoise(self, noisy: Latents, a: PerView, b: PerView) -> tuple[Latents, Latents]:
         """Return the posterior means of the clean image and of the noise; finite for all a, b in [0, 1]."""
         a, b = per_view(a), per_view(b)
         total = (a * a * self.variance + b * b).clamp_min(VARIANCE_FLOOR)
@@ -47,7 +45,7 @@ class Mixture:
         distance = (away * away / total[:, None]).sum(dim=(2, 3, 4), dtype=torch.float64)
         return self.log_weights.double() - 0.5 * distance
 
-    def _mean_of_modes(self, noisy: Tensor, a: Tensor, total: Tensor) -> Float[Tensor, "v c h w"]:
+    def _mean_of_modes(self, noisy: Tensor, a: Tensor, total: Tensor) -> Latents:
         if self.means.shape[1] == 1:
             return self.means[:, 0]
         shares = self.log_joint(noisy, a, total).softmax(dim=1).to(noisy.dtype)

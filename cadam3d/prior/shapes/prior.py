@@ -12,7 +12,7 @@ from cadam3d.core.cameras import Cameras, fitting_distance, turntable
 from cadam3d.core.checks import fail, require_choice, require_range, require_whole
 from cadam3d.core.rendering import Truth
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
-from cadam3d.prior.path import NoisePath, Prediction, per_view
+from cadam3d.prior.path import Latents, NoisePath, PerView, Prediction, per_view
 from cadam3d.prior.shapes.grammar import EXAMPLE
 from cadam3d.prior.shapes.mixture import Mixture
 from cadam3d.prior.shapes.objects import known_objects, known_primitives
@@ -152,13 +152,7 @@ class ShapesPrior(DiffusionPrior):
         )
 
     @torch.no_grad()
-    def predict(
-        self,
-        noisy: Float[Tensor, "v c h w"],
-        t: Float[Tensor, "v"],
-        condition: ShapesCondition,
-        scale: float,
-    ) -> Prediction:
+    def predict(self, noisy: Latents, t: PerView, condition: ShapesCondition, scale: float) -> Prediction:
         """Return the posterior means under guidance, plus the configured error.
 
         Branches of weight 0 are not computed. The clean image and the noise are both computed directly, so
@@ -217,7 +211,7 @@ def _traced(scene: Scene, cameras: Cameras, samples: int, tracer: str) -> tuple[
     return tracer_for(tracer, cameras).trace(scene, cameras, samples), scene
 
 
-def error_field(image: Float[Tensor, "v c h w"], seed: int) -> Float[Tensor, "v c h w"]:
+def error_field(image: Latents, seed: int) -> Latents:
     """Return a smooth field of mean about zero and unit rms, a fixed and continuous function of ``image``.
 
     The image is multiplied with random signs and summed over each cell of a coarse grid, such that white
