@@ -1,34 +1,31 @@
 """Launch: read a command line, refuse one that cannot work before any work starts, and run its command."""
 
+import errno
 import gc
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
-from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
-from cadam3d.io.run_folder import JOBS, RUN_FOLDER, expanded, has_file, typed_path
-from cadam3d.settings.advice import explain, line_of, refused_path, reraise_interrupt
+from cadam3d.io.run_folder import RUN_FOLDER, expanded
+from cadam3d.settings.advice import explain, line_of
 from cadam3d.settings.check import require_effective, require_settings
 from cadam3d.settings.compose import Call, compose_line, run_hydra
 from cadam3d.settings.help import help_text
 from cadam3d.settings.line import (
-    DRY_RUN,
     HYDRA_KEYS,
-    LAUNCHER_KEY,
+    OF_SWEEPS,
     Line,
     key_of,
     quoted,
     read_flags,
     resumed,
-    split,
-    text_of,
 )
-from cadam3d.settings.options import config_dir, with_example
+from cadam3d.settings.options import with_example
 from cadam3d.sweep.plan import require_attempts
 
 TRAINING = ("train", "sweep")  # the commands that have a run folder
@@ -50,12 +47,11 @@ def launch(command: str, words: Sequence[str]) -> int:
             from cadam3d.commands import sweep
 
             return sweep.run(command, line.overrides, line.flags, line.options)
-        cfg = _composed(_without_sweeps(line))
+        cfg = _composed(line)
         if cfg.get("attempts", 1) > 1:
             from cadam3d.commands import attempts
 
             return attempts.run(cfg, line.overrides, line.flags, line.options, line.words)
-        _refuse_sweeps(line)
         call = _call(line, cfg)
         module = import_module(f"cadam3d.commands.{command}")
     # Imported modules stay in memory, so the garbage collector need not scan them.
@@ -76,7 +72,6 @@ def prepare(command: str, words: Sequence[str]) -> tuple[DictConfig, Call]:
         shell = f"in a shell: {line_of(command, words)}"
         if line.is_sweep or line.wants_page:
             raise fail(command, expected="a single run without a page", got=line.words, example=shell)
-        _refuse_sweeps(line)
         cfg = _composed(line)
         if cfg.get("attempts", 1) > 1:
             raise fail("attempts", expected="1 in Python", got=cfg.attempts, example=shell)
@@ -91,9 +86,11 @@ def completing(words: Sequence[str]) -> Iterator[None]:
     except UserError as error:
         raise with_example(error) from error.__cause__
     except OSError as error:
-        if advice := refused_path(error):
-            raise advice from error
-        raise
+        if error.errno not in (errno.ENAMETOOLONG, errno.ELOOP):
+            raise
+        expected = f"one that this system accepts ({error.strerror})"
+        got = str(error.filename)[:60]
+        raise fail("path", expected=expected, got=got, example="a shorter one") from error
 
 
 @contextmanager
@@ -105,11 +102,9 @@ def explaining(command: str, words: Sequence[str]) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
-        reraise_interrupt(error)
-        advice = explain(error, command, words)
-        if advice is None:
-            raise
-        raise advice from error
+        if advice := explain(error, command, words):
+            raise advice from error
+        raise
 
 
 def read_line(command: str, words: Sequence[str]) -> Line:
@@ -119,31 +114,27 @@ def read_line(command: str, words: Sequence[str]) -> Line:
     """
     if command == "doctor":
         words = ["json=true" if word == "--json" else word for word in words]
-    typed, flags = split(words)
-    options = read_flags(flags)
-    is_sweep = command == "sweep" or options.multirun or "hydra.mode=MULTIRUN" in typed
-    line = Line(command, typed, flags, options, is_sweep=is_sweep, words=typed)
+    options, typed = read_flags(words)
+    flags = [word for word in words if word not in typed]
+    line = Line(command, words=typed, overrides=typed, flags=flags, options=options)
     if options.help:
         return line
     _refuse_words(line)
-    overrides = [quoted(override, is_sweep=is_sweep) for override in typed]
-    folders = [Path(options.config_dir)] if options.config_dir else []
-    folders.append(Path(options.config_path) if options.config_path else config_dir())
+    overrides = [quoted(override, is_sweep=line.is_sweep) for override in typed]
     if command in TRAINING:
-        _refuse_resumed_jobs(overrides)
-        overrides = resumed(overrides, is_sweep=is_sweep, folders=folders, retry=line.trusting)
+        overrides = resumed(overrides, is_sweep=line.is_sweep, folders=line.folders, retry=line.trusting)
     elif command in EXPORTING:
         # The exporters load torch.
         from cadam3d.settings.output import exporting
 
-        overrides = exporting(overrides, folders)
+        overrides = exporting(overrides, line.folders)
     return replace(line, overrides=overrides)
 
 
 def _show_page(line: Line) -> None:
     """Print a page: our help, the settings, or one of the pages about Hydra."""
     if line.options.help:
-        print(help_text(line.command, line.overrides, line.options))
+        print(help_text(line.command, line.overrides, line.folders))
     elif line.is_sweep and line.options.cfg:
         from cadam3d.sweep.plan import read_sweep
 
@@ -152,9 +143,7 @@ def _show_page(line: Line) -> None:
         flags = [flag for flag in line.flags if flag not in ("-m", "--multirun")]
         run_hydra("sweep", [*sweep.parts.own, *sweep.jobs[0].overrides, *flags])
     else:
-        has_attempts = any(key_of(override) == "attempts" for override in line.overrides)
-        shown = _without_sweeps(line) if has_attempts else line
-        run_hydra(line.command, [*shown.overrides, *line.flags])
+        run_hydra(line.command, [*line.overrides, *line.flags])
 
 
 def _composed(line: Line) -> DictConfig:
@@ -162,12 +151,21 @@ def _composed(line: Line) -> DictConfig:
 
     Raises ``UserError`` and Hydra's exceptions.
     """
-    cfg = compose_line(line.command, line.overrides, line.options)
-    require_effective(cfg, line.command, line.overrides)
+    is_training = line.command == "train"
+    # Only a line that trains several attempts may have settings of sweeps.
+    of_sweeps = [word for word in line.overrides if is_training and OF_SWEEPS.match(key_of(word))]
+    own = [word for word in line.overrides if word not in of_sweeps]
+    cfg = compose_line(line.command, own, line.options)
+    require_effective(cfg, line.command, own)
     require_settings(cfg)
-    _refuse_several_runs(cfg, line)
-    if line.command == "train":
+    runs = cfg.get("run")
+    if line.command != COMPARING and OmegaConf.is_list(runs):
+        raise fail("run", expected="one run", got=[*runs], example=f"run={runs[0]}")
+    if is_training:
         require_attempts(cfg.get("attempts", 1))
+    if of_sweeps and cfg.get("attempts", 1) == 1:
+        key = key_of(of_sweeps[0])
+        raise fail(key, expected="a sweep or several attempts", got=of_sweeps[0], example="attempts=2")
     return cfg
 
 
@@ -185,25 +183,6 @@ def _call(line: Line, cfg: DictConfig) -> Call:
         )
 
 
-def _is_of_sweeps(override: str) -> bool:
-    """Return whether an override is a setting of sweeps and not of the runs in them."""
-    return key_of(override) == DRY_RUN or LAUNCHER_KEY.match(key_of(override)) is not None
-
-
-def _without_sweeps(line: Line) -> Line:
-    """Return a line of training without settings of sweeps, which several attempts can have."""
-    if line.command != "train":
-        return line
-    return replace(line, overrides=[each for each in line.overrides if not _is_of_sweeps(each)])
-
-
-def _refuse_sweeps(line: Line) -> None:
-    """Refuse a setting of sweeps in a line that trains a single run."""
-    own = [word for word in line.words if _is_of_sweeps(word)]
-    if line.command == "train" and own:
-        raise fail(key_of(own[0]), expected="a sweep or several attempts", got=own[0], example="attempts=2")
-
-
 def _refuse_words(line: Line) -> None:
     """Refuse overrides that no command accepts, and a sweep of a command that cannot be swept."""
     command = line.command
@@ -216,22 +195,3 @@ def _refuse_words(line: Line) -> None:
             raise UserError(f"{key}: cadam3d has no such setting of Hydra. Try: {RUN_FOLDER}=outputs/mine")
     if line.is_sweep and command not in TRAINING:
         raise UserError(f"{command}: only training can be swept. Try: cadam3d {command} --help")
-
-
-def _refuse_several_runs(cfg: DictConfig, line: Line) -> None:
-    """Raise ``UserError`` if a line names several runs and its command does not compare them."""
-    runs = cfg.get("run")
-    if line.command != COMPARING and OmegaConf.is_list(runs):
-        raise fail("run", expected="one run", got=[*runs], example=f"run={runs[0]}")
-
-
-def _refuse_resumed_jobs(overrides: Sequence[str]) -> None:
-    """Refuse ``resume=`` with the folder of a sweep or of attempts, with the line that continues its jobs."""
-    texts = [text_of(override) for override in overrides if key_of(override) == "resume"]
-    if not texts or not has_file(folder := typed_path(texts[-1]), JOBS):
-        return
-    from cadam3d.sweep.folder import read_plan
-
-    plan = read_plan(folder)
-    line = line_of(plan.command, plan.line)
-    raise fail("resume", expected="the folder of a run, not of several", got=texts[-1], example=line)

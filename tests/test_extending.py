@@ -136,18 +136,15 @@ def test_a_gradient_that_is_not_finite_leaves_the_state_finite(bad, energy):
 
 
 def test_the_new_parts_are_in_the_help_and_found_by_their_declarations(place, monkeypatch):
-    from argparse import Namespace
-
     from cadam3d.settings.help import help_text
     from cadam3d.settings.options import config_dir, option_class
     from cadam3d.settings.output import exporting
 
     monkeypatch.syspath_prepend(str(place))
-    flags = Namespace(config_dir=str(place / "myconfigs"), config_path=None, config_name=None)
-    page = help_text("train", ["densifier=energy", "exporter=[xyz]", "metric=[outliers]"], flags)
+    folders = [place / "myconfigs", config_dir()]
+    page = help_text("train", ["densifier=energy", "exporter=[xyz]", "metric=[outliers]"], folders)
     for key in ("densifier.share", "exporter.xyz.min_opacity", "metric.outliers.radius"):
         assert key in page
-    folders = [place / "myconfigs", config_dir()]
     assert option_class("metric", "outliers", folders).numbers
     assert "exporter=[xyz]" in exporting(["output=mine.xyz"], folders)
     for name in [name for name in sys.modules if name.partition(".")[0] == "mypackage"]:

@@ -21,7 +21,6 @@ LINES = [
     ((*TRAIN, "densifer=cadam"), "densifier"),
     ((*TRAIN, "densifier.tau_q=0.5"), "densifier.tau_Q=0.5"),
     ((*TRAIN, "tau_SNR=0.2"), "densifier.tau_SNR=0.2"),
-    ((*TRAIN, "densifier.invisible=skip"), "not of the chosen option. Try: densifier=cadam_"),
     ((*TRAIN, "qqqq.zzzz=5"), "qqqq.zzzz: no such setting"),
     ((*TRAIN, "+x=1"), "x: no such setting"),
     ((*TRAIN, "~steps"), "steps: expected a value"),

@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d.core.checks import fail, nearest
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import is_readable, read_yaml
-from cadam3d.settings.advice import MissingValuesError, settings_page
+from cadam3d.settings.advice import settings_page
 from cadam3d.settings.compose import flatten
 from cadam3d.settings.line import key_of
 from cadam3d.settings.options import (
@@ -63,46 +63,36 @@ WORDS: dict[Any, str] = {
 def require_effective(cfg: DictConfig, command: str, overrides: Sequence[str]) -> None:
     """Raise an exception unless all settings of a line have values, and every override has an effect.
 
-    It is ``MissingValuesError`` for a setting that is still ``???``, ``InterpolationResolutionError`` for one
-    that refers to something that does not exist, and ``UserError`` for settings that were removed or that
-    nothing reads. The keys of chosen components are checked when these are built.
+    It is ``InterpolationResolutionError`` for a setting that refers to something that does not exist, and
+    ``UserError`` for settings that have no value, that were removed or that nothing reads. The keys of chosen
+    components are checked when these are built.
     """
     raw = OmegaConf.to_container(cfg, resolve=False)
     assert isinstance(raw, dict)
     raw.pop("hydra", None)
     if missing := [key for key, value in flatten(raw) if value == NOTHING]:
-        raise MissingValuesError(missing)
+        examples = " ".join(example_word(key) or f"{key}=..." for key in missing)
+        raise UserError(f"{', '.join(missing)}: no value given. Try: {examples}")
     declared = declared_names(command)
     for override in overrides:
         key = key_of(override)
         if key in declared - raw.keys() and (override.startswith("~") or override.endswith("=[]")):
             raise fail(key, expected="a value", got=override, example=example_word(key))
+        group, member = [*key.split("."), ""][:2]
+        chosen = raw[group] if group in LISTS and isinstance(raw.get(group), dict) else {}
+        if isinstance(chosen.get(member), dict) and TARGET not in chosen[member]:
+            raise UserError(f"{group}.{member}: is not chosen. Try: '{group}=[{','.join(chosen)}]'")
     # Plain values come first, so that the message names the wrong value and not a setting that refers to it.
     for key in sorted(raw, key=lambda key: isinstance(raw[key], dict)):
         if "${" in str(raw[key]) and OmegaConf.is_config(value := cfg[key]):
             OmegaConf.to_container(value, resolve=True)
-    _require_known(raw, declared, command)
-    _require_chosen(raw, overrides)
-
-
-def _require_known(raw: Mapping[Any, Any], declared: set[str], command: str) -> None:
-    """Refuse unknown settings. One of the user's own YAML is accepted if another setting refers to it."""
+    # A setting of the user's own YAML is accepted if another setting refers to it.
     references = " ".join(re.findall(r"\$\{[^}]*", str(raw)))
     for name in map(str, raw):
         if name not in declared and not re.search(rf"\b{re.escape(name)}\b", references):
             near = nearest(name, declared)
             meant = f" Did you mean {near}?" if near else ""
             raise UserError(f"{name}: no such setting.{meant} Try: {settings_page(command)}")
-
-
-def _require_chosen(raw: Mapping[Any, Any], overrides: Sequence[str]) -> None:
-    """Refuse the settings of a member that is not chosen, such as ``+callback.candidates.every=5``."""
-    for group, node in raw.items():
-        for member, values in node.items() if group in LISTS and isinstance(node, dict) else ():
-            is_typed = any(key_of(override).startswith(f"{group}.{member}.") for override in overrides)
-            if is_typed and isinstance(values, dict) and TARGET not in values:
-                chosen = ",".join(map(str, node))
-                raise UserError(f"{group}.{member}: is not chosen. Try: '{group}=[{chosen}]'")
 
 
 def require_settings(values: Mapping[Any, Any]) -> None:
@@ -129,30 +119,17 @@ def require_declared(node: Any, kinds: tuple[type, ...], key: str) -> None:
     if not issubclass(cls, kinds):
         expected = f"the path of a class ({_in_words(kinds)})"
         raise fail(f"{key}.{TARGET}", expected=expected, got=raw[TARGET], example=option_word(key))
-    parameters, hints = _signature(cls)
+    signature, hints = _signature(cls)
     names = [name for name in map(str, node) if name != TARGET]
-    _require_keys(names, parameters, key)
+    try:
+        signature.bind(**dict.fromkeys(names))
+    except TypeError as error:  # a key is unknown or lacks
+        raise UserError(f"{key}: {error}. Try: cadam3d train --cfg job") from error
     for name in names:
         reference = REFERENCE.fullmatch(str(raw[name]))
         # The user changes the node to which a setting refers, such as ${prompting}.
         place = reference.group(1) if reference and OmegaConf.is_config(node[name]) else f"{key}.{name}"
         _require(node[name], hints.get(name, Any), place)
-
-
-def _require_keys(names: Sequence[str], parameters: Mapping[str, inspect.Parameter], key: str) -> None:
-    """Raise ``UserError`` unless ``names`` are the parameters of a class; those with a default may lack."""
-    kinds = {each.kind for each in parameters.values()}
-    unknown = [name for name in names if name not in parameters]
-    if unknown and inspect.Parameter.VAR_KEYWORD not in kinds:
-        near = nearest(unknown[0], parameters)
-        meant = f" Did you mean {key}.{near}?" if near else ""
-        raise UserError(f"{key}: there is no key {unknown[0]}.{meant} Try: cadam3d train --cfg job")
-    variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
-    needed = [
-        name for name, each in parameters.items() if each.default is each.empty and each.kind not in variable
-    ]
-    if missing := [name for name in needed if name not in names]:
-        raise UserError(f"{key}: no value for {', '.join(missing)}. Try: +{key}.{missing[0]}=...")
 
 
 def _require(value: Any, declared: Any, key: str) -> None:
@@ -202,10 +179,9 @@ def _is_usable(value: Any) -> bool:
 
 
 @cache
-def _signature(cls: type) -> tuple[Mapping[str, inspect.Parameter], Mapping[str, Any]]:
-    """Return the parameters of a class and their types."""
-    hints = get_type_hints(cls if is_dataclass(cls) else cls.__init__)
-    return inspect.signature(cls).parameters, hints
+def _signature(cls: type) -> tuple[inspect.Signature, Mapping[str, Any]]:
+    """Return how a class is called, and the types of its parameters."""
+    return inspect.signature(cls), get_type_hints(cls if is_dataclass(cls) else cls.__init__)
 
 
 @cache

@@ -21,6 +21,7 @@ from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
+from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import read_yaml
 from cadam3d.settings.options import config_dir
@@ -83,12 +84,15 @@ def compose(
     """
     register_resolvers()
     place = (folder or config_dir()).resolve()
-    require_files(place, "--config-path")
+    for flag, chosen in (("--config-path", place), ("--config-dir", Path(search_path or "."))):
+        require(chosen.is_dir(), flag, expected="a folder", got=str(chosen), example=f"{flag}=.")
     words = list(overrides)
     if search_path is not None:
-        require_files(Path(search_path), "--config-dir")
         words = [word for word in words if not word.startswith(f"{SEARCH_PATH}=")]
-        more = [each for word in overrides if word not in words for each in _parsed(word)]
+        parser = OverridesParser.create()
+        more = [
+            path for word in overrides if word not in words for path in parser.parse_override(word).value()
+        ]
         places = [f"file://{Path(search_path).absolute()}", *more]
         words.append(f"{SEARCH_PATH}=[{','.join(map(quote, places))}]")
     try:
@@ -145,23 +149,6 @@ def run_hydra(
     finally:
         sys.argv = arguments_before
         os.environ["HYDRA_FULL_ERROR"] = switch_before or "0"
-
-
-def _parsed(override: str) -> Any:
-    return OverridesParser.create().parse_override(override).value()
-
-
-def require_files(folder: Path, flag: str) -> None:
-    """Raise ``UserError`` unless ``folder`` is one, and its YAML files are regular files.
-
-    Reading a named pipe would never end. Only the folders of groups are searched.
-    """
-    if not folder.is_dir():
-        raise UserError(f"{flag}: expected a folder, got {str(folder)!r}. Try: {flag}=.")
-    groups = [path.relative_to(config_dir()) for path in config_dir().rglob("*") if path.is_dir()]
-    for path in [path for group in (Path(), *groups) for path in (folder / group).glob("*.yaml")]:
-        if path.exists() and not path.is_file() and not path.is_dir():
-            raise UserError(f"{flag}: {path} is not a regular file. Try: cadam3d train --help")
 
 
 def load_config(path: Path) -> DictConfig:

@@ -8,7 +8,6 @@ builds on, or else in another option with the same class. Nothing is composed an
 import re
 import shutil
 import textwrap
-from argparse import Namespace
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -18,11 +17,20 @@ from typing import Any
 
 from cadam3d.core.checks import fail, nearest
 from cadam3d.io.reading import read_text, read_yaml
-from cadam3d.settings.options import TARGET, config_dir, option_file, option_names, package_of, read_option
+from cadam3d.settings.options import (
+    TARGET,
+    command_files,
+    config_dir,
+    default_options,
+    option_file,
+    option_names,
+    package_of,
+    read_option,
+)
 
 NARROWEST, WIDEST = 60, 120  # characters per line
 # Characters. The description of a longer key begins on the next line.
-FIRST_COLUMN = 34
+FIRST_COLUMN = 32
 SCHEDULES = "cadam3d.core.schedule."
 SENTENCE_END = re.compile(r"(?<=[.!?])(?<!al\.)(?<!sec\.)(?<!fig\.)(?<!eq\.)\s+")
 KEY = re.compile(r"(\s*)(\w+):(?=\s|$)(.*)")
@@ -49,7 +57,7 @@ class Option:
     about: str  # paragraphs between empty lines; a line that begins with a space is an example
     base: str = ""  # the option of the same group that this one builds on, or ""
     settings: tuple[Setting, ...]
-    changed: tuple[str, ...]  # keys to which the file itself gives a value
+    changed: tuple[str, ...] = ()  # keys to which the file itself gives a value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +65,8 @@ class Choices:
     """A group of options as a command uses it."""
 
     name: str  # such as "camera", or "initializer/fallback" for a group inside a group
-    chosen: tuple[str, ...]  # the default
-    words: str
+    chosen: tuple[str, ...] = ()  # the default
+    words: str = "an option for the setting of this name"
 
 
 class Library:
@@ -80,38 +88,35 @@ class Library:
         return SENTENCE_END.split(about.partition("\n")[0], maxsplit=1)[0]
 
     def groups(self, command: str) -> dict[str, Choices]:
-        """Return the groups of a command; the groups of the command that it builds on come first."""
-        path = self._command(command)
-        entries = [found for line in read_text(path).splitlines() if (found := ENTRY.match(line))]
-        words = {entry[1]: entry[2] or "" for entry in entries}
-        bases, choices = _defaults(read_yaml(path))
-        groups = {name: group for base in bases for name, group in self.groups(base).items()}
-        for name, value in choices.items():
-            if name != "hydra":
-                several = value if isinstance(value, list) else [] if value is None else [value]
-                groups[name] = Choices(name=name, chosen=tuple(map(str, several)), words=words[name])
+        """Return the groups of a command that have options, each followed by the groups inside it."""
+        lines = [line for path in command_files(command) for line in read_text(path).splitlines()]
+        words = {entry[1]: entry[2] or "" for line in lines if (entry := ENTRY.match(line))}
+        groups: dict[str, Choices] = {}
+        for name, value in default_options(command).items():
+            chosen = value if isinstance(value, list) else [] if value is None else [value]
+            inner = {each: Choices(name=each) for each in self.options if each.startswith(f"{name}/")}
+            if name in self.options:
+                groups |= {name: Choices(name=name, chosen=tuple(chosen), words=words[name]), **inner}
         return groups
 
     def command(self, name: str) -> Option:
         """Return a command with its settings outside of all groups."""
-        path = self._command(name)
-        values = read_yaml(path)
-        outside = {"defaults", "hydra", *self.groups(name)}
-        own = {key: value for key, value in values.items() if key not in outside}
-        inherited = [each for base in _defaults(values)[0] for each in self.command(base).settings]
-        settings = (*inherited, *_settings(own, _words_in(path)))
-        return Option(about=about_of(read_text(path)), settings=settings, changed=tuple(own))
+        outside = {"defaults", "hydra", *default_options(name)}
+        settings: list[Setting] = []
+        for path in command_files(name):
+            own = {key: value for key, value in read_yaml(path).items() if key not in outside}
+            settings += _settings(own, _words_in(path))
+        return Option(about=about_of(read_text(config_dir() / f"{name}.yaml")), settings=tuple(settings))
 
-    def option(self, group: str, name: str, command: str = "train") -> Option:
+    def option(self, group: str, name: str) -> Option:
         """Return an option with all its settings, including the settings of the option that it builds on.
 
-        An option may also change settings and groups elsewhere. Their words come from ``command``.
+        An option may also change settings and groups elsewhere, which are described in their own group.
         """
         path = option_file(group, name, self.folders)
         values, content = read_option(group, name, self.folders), read_yaml(path)
         values.pop("hydra", None)
         bases, choices = _defaults(content)
-        known = self._words_elsewhere(values, group, command)
         chosen = [
             Setting(key=key, value=_spelled(value), words=self._about_choice(key, value))
             for key, value in choices.items()
@@ -119,52 +124,29 @@ class Library:
         ]
         own = {key: value for key, value in content.items() if key != "defaults"}
         changed = _settings(own, {}, "".join(f"{part}." for part in package_of(group, path)))
+        words = {
+            key: self._words_by_class.get((target, key.rpartition(".")[2]), "")
+            for key, target in _keys_by_class(values)
+        }
         return Option(
             about=about_of(read_text(path)),
             base=next((base for base in bases if "/" not in base), ""),
-            settings=(*chosen, *_settings(values, known | self._words(group, name, known))),
+            settings=(*chosen, *_settings(values, words | self._words(group, name))),
             changed=(*choices, *(each.key for each in changed)),
         )
 
-    def _command(self, name: str) -> Path:
-        for folder in self.folders:
-            if (path := folder / f"{name}.yaml").is_file():
-                return path
-        raise fail("--config-name", expected="a file of YAML", got=f"{name}.yaml", example="cadam3d doctor")
-
-    def _words(self, group: str, name: str, known: Mapping[str, str]) -> dict[str, str]:
-        """Return the words in the file of an option and in those that it builds on, by full key.
-
-        They are notes about the values, if ``known`` has the words about the keys of other groups.
-        """
+    def _words(self, group: str, name: str) -> dict[str, str]:
+        """Return the words in the file of an option and in those that it builds on, by full key."""
         path = option_file(group, name, self.folders)
         words: dict[str, str] = {}
         for base in _defaults(read_yaml(path))[0]:
             inner, _, option = base.lstrip("/").rpartition("/")
-            words |= self._words(inner or group, option, known)
-        place = package_of(group, path)
+            words |= self._words(inner or group, option)
         for last, note in _words_in(path).items():
-            key = ".".join([*place, last])
-            meaning = words.get(key) or (known.get(key, "") if not place else "")
-            words[key] = _with_note(meaning, note)
+            key = ".".join([*package_of(group, path), last])
+            meaning = words.get(key, "").removesuffix(".")
+            words[key] = f"{meaning}. Here: {note}" if meaning and note not in meaning else note
         return words
-
-    def _words_elsewhere(self, values: dict[str, Any], group: str, command: str) -> dict[str, str]:
-        """Return the words that the command and other options have for the keys of an option.
-
-        These are the options of the same class, and for a setting of another group all its options.
-        """
-        words = {each.key: each.words for each in self.command(command).settings}
-        groups = self.groups(command)
-        for root in values.keys() & self.options.keys() - {group.partition("/")[0]}:
-            first = groups[root].chosen if root in groups else ()
-            for name in reversed([*first, *self.options[root]]):
-                words |= self._words(root, name, {})
-        same_class = {
-            key: self._words_by_class.get((target, key.rpartition(".")[2]), "")
-            for key, target in _keys_by_class(values)
-        }
-        return same_class | words
 
     @cached_property
     def _words_by_class(self) -> dict[tuple[str, str], str]:
@@ -183,28 +165,26 @@ class Library:
         return " ".join(self.summary(group, name) for name in names)
 
 
-def help_text(command: str, overrides: Sequence[str], options: Namespace) -> str:
+def help_text(command: str, overrides: Sequence[str], folders: Sequence[Path]) -> str:
     """Return the help of a command, or of the options that the overrides choose, such as ``camera=orbit``.
 
     A word without ``=`` that names a group lists its options; overrides of single settings are ignored.
-    ``options`` are the flags of the line, of which ``--config-path`` and ``--config-dir`` name folders of
-    YAML files. Raises ``UserError`` for a group or an option that does not exist.
+    ``folders`` have the YAML files. Raises ``UserError`` for a group or an option that does not exist.
     """
-    folders = [Path(options.config_dir)] if options.config_dir else []
-    library = Library([*folders, Path(options.config_path) if options.config_path else config_dir()])
-    groups = _groups(library, options.config_name or command)
+    library = Library(folders)
+    groups = library.groups(command)
     parts = []
     for word in overrides:
         name, equals, value = word.lstrip("+").partition("=")
         if name in groups and equals:
             chosen = [option for option in NAME.findall(value) if option != "null"]
-            parts += [_option(library, command, name, option) for option in chosen]
+            parts += [_option(library, name, option) for option in chosen]
         elif name in groups:
-            parts += [_group(library, groups[name]), _hint(command, groups[name])]
+            parts.append(_group(library, groups[name]))
         elif name in library.options or not equals:
             line = f"cadam3d {command} --help {nearest(name, groups)}".rstrip()
             raise fail("--help", expected=f"a group of {command}", got=name, example=line)
-    return "\n\n".join(parts) if parts else _overview(library, command, options, groups)
+    return "\n\n".join(parts or _overview(library, command, groups))
 
 
 def about_of(text: str) -> str:
@@ -282,13 +262,6 @@ def _settings(values: dict[str, Any], words: Mapping[str, str], prefix: str = ""
             yield from _settings(value, words, f"{key}.")
 
 
-def _with_note(meaning: str, note: str) -> str:
-    """Return the description of a key with a note about its value; a repetition is left out."""
-    if not meaning or not note or note in meaning:
-        return meaning or note
-    return f"{meaning.removesuffix('.')}. Here: {note}"
-
-
 def _spelled(value: Any) -> str:
     """Return a value as a command line spells it, or the call that builds an object."""
     if isinstance(value, list):
@@ -303,30 +276,18 @@ def _spelled(value: Any) -> str:
     return str(value) or '""'
 
 
-def _groups(library: Library, command: str) -> dict[str, Choices]:
-    """Return the groups of a command that have options, each followed by the groups inside it."""
-    groups: dict[str, Choices] = {}
-    for group in library.groups(command).values():
-        for name in library.options:
-            if name == group.name:
-                groups[name] = group
-            elif name.startswith(f"{group.name}/"):
-                words = "an option for the setting of this name"
-                groups[name] = Choices(name=name, chosen=(), words=words)
-    return groups
-
-
-def _overview(library: Library, command: str, options: Namespace, groups: dict[str, Choices]) -> str:
+def _overview(library: Library, command: str, groups: dict[str, Choices]) -> list[str]:
     """Return the purpose of a command, its settings, and its groups with their options."""
-    about = library.command(options.config_name or command)
-    parts = [_paragraphs(about.about)]
-    if about.settings:
-        parts.append("Settings (key=value):\n" + _table_of(about.settings))
+    about = library.command(command)
+    parts = [_wrapped(about.about), f"Settings (key=value):\n{_table(map(_row, about.settings))}"]
     if groups:
-        parts.append(_fill("Parts (group=option, or 'group=[one,two]'). * marks what is chosen by default."))
+        parts.append(
+            _wrapped("Parts (group=option, or 'group=[one,two]'). * marks what is chosen by default.")
+        )
         parts += [_group(library, group) for group in groups.values()]
-        parts.append(_hint(command, groups.get("densifier") or next(iter(groups.values()))))
-    return "\n\n".join(parts)
+        example = next(f"{group.name}={group.chosen[0]}" for group in groups.values() if group.chosen)
+        parts.append(_wrapped(f"More: cadam3d {command} --help {example}, or cadam3d {command} --cfg job."))
+    return parts
 
 
 def _group(library: Library, group: Choices) -> str:
@@ -335,53 +296,46 @@ def _group(library: Library, group: Choices) -> str:
         (("* " if name in group.chosen else "  ") + name, library.summary(group.name, name))
         for name in library.options[group.name]
     ]
-    title = f"{group.name}: {group.words}" if group.words else group.name
-    return "\n".join([_fill(title, indent="  "), *_table(rows, widest=24)])
+    return f"{_wrapped(f'{group.name}: {group.words}')}\n{_table(rows)}"
 
 
-def _option(library: Library, command: str, group: str, name: str) -> str:
+def _option(library: Library, group: str, name: str) -> str:
     """Return the text for an option and its settings. Raises ``UserError`` if there is no such option."""
-    option = library.option(group, name, command)
-    lines = [f"{group}={name}", _paragraphs(option.about)]
+    option = library.option(group, name)
+    lines = [f"{group}={name}", _wrapped(option.about)]
     if option.base:
         changed = ", ".join(key.removeprefix(f"{group}.") for key in option.changed)
-        lines.append(_fill(f"Builds on {group}={option.base} and changes {changed}."))
-    return "\n".join([*lines, _table_of(option.settings) or "  It has no settings."])
+        lines.append(_wrapped(f"Builds on {group}={option.base} and changes {changed}."))
+    return "\n".join([*lines, _table(map(_row, option.settings)) or "  It has no settings."])
 
 
-def _table_of(settings: Iterable[Setting]) -> str:
-    """Return a table with one row for each setting, under the key of the command line."""
-    rows = []
-    for each in settings:
-        sign = "" if not each.value else ": " if each.value.endswith(")") else "="
-        rows.append((f"  {each.key}{sign}{each.value}", each.words))
-    return "\n".join(_table(rows, widest=FIRST_COLUMN))
+def _row(setting: Setting) -> tuple[str, str]:
+    """Return a setting as it is typed, and its words."""
+    sign = "" if not setting.value else ": " if setting.value.endswith(")") else "="
+    return f"  {setting.key}{sign}{setting.value}", setting.words
 
 
-def _table(rows: Sequence[tuple[str, str]], *, widest: int) -> Iterator[str]:
-    """Yield the lines of a table of two columns, the second of which is wrapped."""
-    column = min(max((len(first) for first, _ in rows), default=0), widest) + 2
+def _table(rows: Iterable[tuple[str, str]]) -> str:
+    """Return a table of two columns, the second of which is wrapped."""
+    lines = []
     for first, second in rows:
-        lines = textwrap.wrap(second, _width() - column, break_long_words=False, break_on_hyphens=False)
-        is_short = len(first) <= column - 2
-        yield (first.ljust(column) + (lines.pop(0) if lines else "")).rstrip() if is_short else first
-        yield from (" " * column + line for line in lines)
+        wrapped = textwrap.wrap(
+            second, _width() - FIRST_COLUMN, break_long_words=False, break_on_hyphens=False
+        )
+        if len(first) > FIRST_COLUMN - 2:
+            wrapped.insert(0, "")
+        lines.append((first.ljust(FIRST_COLUMN) + (wrapped.pop(0) if wrapped else "")).rstrip())
+        lines += [" " * FIRST_COLUMN + line for line in wrapped]
+    return "\n".join(lines)
 
 
-def _paragraphs(text: str) -> str:
-    """Wrap each line of a text, except those that begin with a space."""
-    return "\n".join(line if line.startswith(" ") else _fill(line) for line in text.splitlines())
-
-
-def _hint(command: str, group: Choices) -> str:
-    """Return a hint about the pages with more details."""
-    example = f"{group.name}={group.chosen[0] if group.chosen else 'NAME'}"
-    return _fill(f"More: cadam3d {command} --help {example}, or cadam3d {command} --cfg job.")
-
-
-def _fill(text: str, *, indent: str = "") -> str:
-    """Return ``text`` in lines of the terminal, the later ones indented; words stay whole."""
-    return textwrap.fill(text, _width(), subsequent_indent=indent, break_on_hyphens=False)
+def _wrapped(text: str) -> str:
+    """Return a text in lines of the terminal, except those that begin with a space; words stay whole."""
+    lines = text.splitlines()
+    return "\n".join(
+        line if line.startswith(" ") else textwrap.fill(line, _width(), break_on_hyphens=False)
+        for line in lines
+    )
 
 
 def _width() -> int:

@@ -15,9 +15,8 @@ from typing import Any
 
 from hydra.utils import get_object
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from cadam3d.core.checks import nearest
+from cadam3d.core.checks import fail, nearest
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import read_text, read_yaml
 from cadam3d.io.run_folder import LATEST
@@ -49,10 +48,14 @@ def option_file(group: str, name: str, folders: Sequence[Path] = ()) -> Path:
     for folder in folders or (config_dir(),):
         if (path := folder / group / f"{name}.yaml").is_file():
             return path
-    known = option_names(group, folders)
-    near = nearest(name, known)
-    word = f"{group}={near}" if near else option_word(group)
-    raise UserError(f"{group}: expected one of {'|'.join(known)}, got {name!r}. Try: {word}")
+    raise unknown_option(group, name, option_names(group, folders))
+
+
+def unknown_option(group: str, got: str, known: Sequence[str], command: str = "train") -> UserError:
+    """Return the error for an option that a group does not have, with the nearest one."""
+    near = nearest(got, known)
+    example = f"{group}={near}" if near else option_word(group, command)
+    return fail(group, expected=f"one of {'|'.join(known)}", got=got, example=example)
 
 
 def read_option(group: str, name: str, folders: Sequence[Path] = ()) -> dict[str, Any]:
@@ -62,7 +65,9 @@ def read_option(group: str, name: str, folders: Sequence[Path] = ()) -> dict[str
     option that is unknown or is no dict of YAML.
     """
     place, values = _read(group, name, folders)
-    return _nested(place, values)
+    for part in reversed(place):
+        values = {part: values}
+    return values
 
 
 def package_of(group: str, path: Path) -> list[str]:
@@ -101,26 +106,26 @@ def load_class(target: object, key: str) -> type:
     return found
 
 
+def command_files(command: str) -> list[Path]:
+    """Return the YAML file of a command, after those of the commands that it builds on."""
+    path = config_dir() / f"{command}.yaml"
+    bases = [entry for entry in read_yaml(path)["defaults"] if isinstance(entry, str) and entry != "_self_"]
+    return [*(file for base in bases for file in command_files(base)), path]
+
+
 def default_options(command: str = "train") -> dict[str, str | list[str] | None]:
     """Return the option that each group of a command has by default: a list where several can be chosen.
 
     Groups of the command that it builds on come first, so ``sweep`` begins with the groups of ``train``.
     """
-    found: dict[str, Any] = {}
-    for entry in read_yaml(config_dir() / f"{command}.yaml").get("defaults", ()):
-        if isinstance(entry, Mapping):
-            found |= entry
-        elif entry != "_self_":
-            found |= default_options(entry)
-    return found
+    entries = [entry for path in command_files(command) for entry in read_yaml(path)["defaults"]]
+    return {group: name for each in entries if isinstance(each, Mapping) for group, name in each.items()}
 
 
 def declared_names(command: str) -> set[str]:
     """Return the settings and groups that the YAML of a command declares, with those that it builds on."""
-    page = read_yaml(config_dir() / f"{command}.yaml")
-    bases = [entry for entry in page["defaults"] if isinstance(entry, str) and entry != "_self_"]
-    own = {*page, *default_options(command)} - {"defaults"}
-    return own.union(*map(declared_names, bases))
+    settings = {name for path in command_files(command) for name in read_yaml(path)}
+    return settings.union(default_options(command)) - {"defaults"}
 
 
 def default_option(group: str, command: str = "train") -> str | list[str] | None:
@@ -150,11 +155,7 @@ def example_value(key: str) -> Any:
         if reference := REFERENCE.fullmatch(str(found)):
             with suppress(LookupError):
                 return example_value(reference.group(1))
-        if "${" in str(found) and not reference:
-            with suppress(OmegaConfBaseException):
-                train = read_yaml(config_dir() / "train.yaml")
-                found = OmegaConf.select(OmegaConf.create({**train, **values}), key)
-        if _is_typed(found):
+        elif not isinstance(found, dict) and NOTHING not in str(found) and "${" not in str(found):
             return found
     raise LookupError(key)
 
@@ -193,30 +194,14 @@ def _read(group: str, name: str, folders: Sequence[Path]) -> tuple[list[str], di
     if not isinstance(content, dict):
         raise UserError(f"{path}: expected keys with values, got other data. Try: {option_word(group)}")
     place = package_of(group, path)
-    merged: dict[str, Any] = {}
+    merged = []
     for base in content.pop("defaults", ()):
         if isinstance(base, str) and base != "_self_":
             file, _, below = base.partition("@")
             other, _, option = file.rpartition("/")
             _, values = _read(other.lstrip("/") or group, option, folders)
-            merged = _merged(
-                merged, _nested([part for part in [below] if part not in ("", "_here_")], values)
-            )
-    return place, _merged(merged, content)
-
-
-def _nested(place: Sequence[str], values: dict[str, Any]) -> dict[str, Any]:
-    """Return ``values`` inside dicts with the keys ``place``."""
-    for part in reversed(place):
-        values = {part: values}
-    return values
-
-
-def _merged(base: Any, changes: Any) -> Any:
-    """Return ``base`` with ``changes``, as Hydra merges them: dicts key by key, other values as a whole."""
-    if not isinstance(base, dict) or not isinstance(changes, dict):
-        return changes
-    return base | {key: _merged(base.get(key), value) for key, value in changes.items()}
+            merged.append(values if below in ("", "_here_") else {below: values})
+    return place, OmegaConf.to_container(OmegaConf.merge(*merged, content)) if merged else content
 
 
 def _places(key: str) -> Iterator[dict[str, Any]]:
@@ -249,20 +234,10 @@ def _inside(values: Any, parts: Sequence[str]) -> Any:
     return values
 
 
-def _is_typed(value: Any) -> bool:
-    """Return whether a value can be an example: no object, and no call such as ``${now:%Y}``."""
-    text = str(value)
-    return NOTHING not in text and TARGET not in text and not ("${" in text and ":" in text)
-
-
 def _grammar(value: Any) -> str:
     """Return a plain value in Hydra's grammar of overrides."""
-    if isinstance(value, Mapping):
-        return "{" + ",".join(f"{key}:{_grammar(each)}" for key, each in value.items()) + "}"
     if isinstance(value, list):
         return "[" + ",".join(map(_grammar, value)) + "]"
     if value is None or isinstance(value, bool):
         return str(value).lower().replace("none", "null")
-    # Between quotation marks, Hydra's grammar reads an interpolation inside another one, and braces as text.
-    text = str(value)
-    return '"' + text.replace('"', '\\"') + '"' if "{" in text else text
+    return str(value)

@@ -17,7 +17,6 @@ import shlex
 import stat
 from collections.abc import Collection, Iterator, Sequence
 from functools import cache
-from inspect import isabstract
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -26,7 +25,6 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
-from cadam3d.core import schedule
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import KINDS, read_text, read_yaml
@@ -47,11 +45,8 @@ OPTION = re.compile(rf"{WORD}(?:[./]{WORD})*", re.ASCII)
 REFERENCE = re.compile(r"\$\{(?!hydra\b)[\w.]+\}", re.ASCII)
 INTERPOLATION = re.compile(r"(?<!\\)(?:\\\\)*\$\{")
 NAMED_TARGET = re.compile(rf"\b{TARGET}:\s*[\"']?([\w.]+)")
-SCHEDULES = frozenset(
-    f"{kind.__module__}.{kind.__qualname__}"
-    for kind in vars(schedule).values()
-    if isinstance(kind, type) and issubclass(kind, schedule.Schedule) and not isabstract(kind)
-)
+# The only class of this package that a setting may name although no YAML file does.
+CONSTANT = "cadam3d.core.schedule.Constant"
 
 
 def is_trusted(overrides: Sequence[str]) -> bool:
@@ -181,7 +176,8 @@ def _lacking(override: Override, folders: tuple[Path, ...]) -> str:
         node = {part: node}
     if _unknown(node, folders):
         return "plain values and components that this version of cadam3d has"
-    if any(INTERPOLATION.search(REFERENCE.sub("_", text)) for text in _texts(value)):
+    texts = [text for _, text in _pairs([value]) if isinstance(text, str)]
+    if any(INTERPOLATION.search(REFERENCE.sub("_", text)) for text in texts):
         return "interpolations that only refer to other settings"
     return ""
 
@@ -209,7 +205,7 @@ def _known_targets(folders: tuple[Path, ...]) -> frozenset[str]:
     """Return the targets that the YAML files of all groups of components in ``folders`` name."""
     groups = [path.name for path in config_dir().iterdir() if path.is_dir() and path.name not in MACHINERY]
     files = [path for folder in folders for group in groups for path in (folder / group).rglob("*.yaml")]
-    return SCHEDULES.union(*(NAMED_TARGET.findall(read_text(path)) for path in files))
+    return frozenset([CONSTANT]).union(*(NAMED_TARGET.findall(read_text(path)) for path in files))
 
 
 def _unknown(node: Any, folders: tuple[Path, ...]) -> str:
@@ -226,19 +222,11 @@ def _unknown(node: Any, folders: tuple[Path, ...]) -> str:
 
 
 def _pairs(node: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield every key with its value in nested dicts and lists. OmegaConf makes lists of tuples too."""
-    if isinstance(node, dict):
-        yield from node.items()
-    for inner in node.values() if isinstance(node, dict) else node if isinstance(node, list | tuple) else ():
-        yield from _pairs(inner)
-
-
-def _texts(node: Any) -> Iterator[str]:
-    """Yield every text in nested dicts and lists."""
-    if isinstance(node, str):
-        yield node
-    for inner in node.values() if isinstance(node, dict) else node if isinstance(node, list | tuple) else ():
-        yield from _texts(inner)
+    """Yield every key with its value in nested dicts and lists; the items of a list have the key "item"."""
+    items = [("item", each) for each in node] if isinstance(node, list | tuple) else []
+    for key, value in node.items() if isinstance(node, dict) else items:
+        yield key, value
+        yield from _pairs(value)
 
 
 def _refuse(path: Path, found: str, expected: str, retry: str) -> NoReturn:

@@ -16,10 +16,11 @@ from omegaconf.errors import InterpolationResolutionError
 from cadam3d.core.checks import fail, require, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import RUN_FOLDER, typed_path
-from cadam3d.settings.advice import RefusedJobError
+from cadam3d.settings.advice import explain
 from cadam3d.settings.check import require_effective, require_settings
 from cadam3d.settings.compose import compose_line, flatten
 from cadam3d.settings.line import DRY_RUN, LAUNCHER_KEY, SWEEP_FOLDER, key_of
+from cadam3d.settings.options import with_example
 from cadam3d.sweep.folder import Job
 from cadam3d.sweep.grid import (
     ALWAYS_SHOWN,
@@ -192,8 +193,8 @@ class Composer:
 def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> Sweep:
     """Return the sweep that a line describes.
 
-    Raises ``UserError`` for a line with a single job or with settings that a sweep cannot have, and
-    ``RefusedJobError`` for the first job that cannot run.
+    Raises ``UserError`` for a line with a single job or with settings that a sweep cannot have, and for the
+    first job that cannot run.
     """
     parts = sort_overrides(overrides)
     cfg = compose_sweep(parts, options)
@@ -285,14 +286,17 @@ def sort_overrides(overrides: Sequence[str]) -> Parts:
 
 
 def compose_all(jobs: Sequence[Job], composer: Composer) -> list[Composed]:
-    """Return the settings of every job. Raises ``RefusedJobError`` for the first one that cannot run."""
+    """Return the settings of every job. Raises ``UserError`` for the first one that cannot run."""
     composed = []
     for job in jobs:
         try:
             composed.append(composer.compose(job.overrides))
             _refuse_attempts(composed[-1])
         except Exception as error:
-            raise RefusedJobError(job.arm, job.overrides) from error
+            if (reason := explain(error, "train", job.overrides)) is None:
+                raise
+            arm = f"arm {job.arm}: " if job.arm else ""
+            raise UserError(f"{arm}{with_example(reason)}") from error
     return composed
 
 

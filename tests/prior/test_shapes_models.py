@@ -136,7 +136,7 @@ def test_doctor_lists_the_models_of_the_package_as_ready(name, models):
 
 def test_a_sweep_on_these_priors_knows_the_settings_that_its_jobs_write():
     """Otherwise it would take its own finished jobs for those of another sweep."""
-    composer = Composer(read_flags([]), [])
+    composer = Composer(read_flags([])[0], [])
     for values in (["prompting.below_deg=-5.0"], ["prompting.below_deg=-7.5"]):
         for name in ("shapes_sd", "shapes_sd3"):
             line = ["prompt=a red cube", f"prior={name}", *values]

@@ -250,12 +250,6 @@ def test_numbers_that_were_measured_in_different_ways_are_not_compared(train):
     assert (only_folder() / "best").readlink() == Path("seed=1")  # as before, by psnr
 
 
-def test_resuming_the_folder_of_attempts_is_refused_with_the_line_that_continues_them(train):
-    train(*LINE)
-    code, _, err = train("resume=outputs/latest")
-    assert (code, err.endswith("Try: cadam3d train 'prompt=an attempt' attempts=4\n")) == (1, True), err
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [

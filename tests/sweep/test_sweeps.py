@@ -632,7 +632,7 @@ LINES = (
 
 
 def test_settings_changed_after_composing_equal_those_that_hydra_composes(sweep):
-    composer = plan.Composer(read_flags([]), [])
+    composer = plan.Composer(read_flags([])[0], [])
     for _ in range(2):  # the second time, nothing is composed
         for line in LINES:
             cfg = OmegaConf.to_container(settings.compose(line), resolve=True)
@@ -644,7 +644,7 @@ def test_many_jobs_that_differ_in_values_are_composed_once(sweep, monkeypatch):
     original = plan.compose_line
     monkeypatch.setattr(plan, "compose_line", lambda *args: counted.append(args) or original(*args))
     line = ["prompt='a cube'", "seed=range(0,30)", "densifier.tau_Q=0.5,0.7"]
-    found = plan.read_sweep("sweep", line, read_flags([])).composed
+    found = plan.read_sweep("sweep", line, read_flags([])[0]).composed
     assert [job.get("seed") for job in found] == [seed for seed in range(30) for _ in range(2)]
     assert len(counted) == 3  # the sweep, what its plain values are, and one job
 
