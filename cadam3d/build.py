@@ -50,7 +50,11 @@ def build_trainer(
     """
 
     def part(name: str, kind: type) -> Any:
-        return given[name] if name in given else component(cfg[name], kind, name)
+        if name not in given:
+            return component(cfg[name], kind, name)
+        is_right = isinstance(given[name], kind)
+        require(is_right, name, expected=f"an object of class {kind.__name__}", got=given[name])
+        return given[name]
 
     require_unused(cfg)
     require_whole("steps", cfg.steps, low=1, high=FAR_STEP)

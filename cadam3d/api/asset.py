@@ -6,7 +6,6 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,25 +14,14 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from cadam3d.api.guest import (
-    as_guest,
-    literal,
-    logging_messages,
-    path_text,
-    plain,
-    require_free,
-    require_object,
-    require_words,
-    usual_modes,
-)
+from cadam3d.api.guest import as_guest, literal, logging_messages, plain, require_free, usual_modes
 from cadam3d.build import option
 from cadam3d.commands.export import export, set_title
 from cadam3d.commands.messages import note_backend
 from cadam3d.commands.opened import OpenedAsset, find_asset, find_run
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import require, require_whole
+from cadam3d.core.checks import fail, require_choice, require_whole
 from cadam3d.core.device import resolve_device
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.mesh.surface import SurfaceSettings
 from cadam3d.core.rendering import RenderFn, RenderOutput, Subject
@@ -74,7 +62,7 @@ def load(
 
     Raises ``UserError`` if the folder or the file cannot be read.
     """
-    place = expanded(path_text("path", path, 'load("outputs/latest")'))
+    place = expanded(os.fspath(path))
     renders = option("rasterizer", rasterizer, Rasterizer)
     # The name of something that does not exist means a folder if it has no suffix.
     if place.is_dir() or not (place.suffix or place.exists()):
@@ -101,14 +89,6 @@ class Asset:
     rasterizer: Rasterizer = field(
         default_factory=lambda: option("rasterizer", "auto", Rasterizer), kw_only=True
     )
-
-    def __post_init__(self) -> None:
-        require_object("gaussians", self.gaussians, Gaussians, "load(PATH).gaussians")
-        require_object("rasterizer", self.rasterizer, Rasterizer, 'load(PATH, rasterizer="cpu")')
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the fields alone: a copy makes a renderer of its own, which shows its own Gaussians."""
-        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -148,16 +128,12 @@ class Asset:
         turn["elevations_deg"] = None if elevation_deg is None else [elevation_deg]
         turn = {name: plain(value) for name, value in turn.items() if value is not None}
         if cameras is not None and turn:
-            raise UserError(
-                f"cameras: expected cameras or the settings of a turn, got both ({', '.join(turn)}). "
-                "Try: cameras=None"
-            )
+            raise fail("cameras", expected="None with settings of a turn", got=turn, example="cameras=None")
         look = {"kinds": [kind]} | ({} if background is None else {"background": plain(background)})
         settings: ImagesExporter = option("exporter", "images", ImagesExporter, turn | look)
         if cameras is None:
             cameras, away = settings.ring(settings.views, settings.elevations_deg[0]), settings.distance
         else:
-            _require_cameras(cameras)
             away = float(cameras.positions.norm(dim=-1).mean())
         subject = Subject(self.gaussians, self._render)
         pictures = []
@@ -178,21 +154,11 @@ class Asset:
     def rasterize(self, cameras: Cameras, background: Float[Tensor, "v 3"] | None = None) -> RenderOutput:
         """Return the exact numbers of a render, as tensors without gradient: rgb, alpha, depth and radii.
 
-        ``background`` is one RGB colour in [0, 1] per view; None is black. Raises ``UserError`` for arguments
-        of another type or shape.
+        ``background`` is one RGB colour in [0, 1] per view; None is black.
         """
-        _require_cameras(cameras)
-        if background is None:
-            background = torch.zeros(len(cameras), 3)
-        require_object("background", background, Tensor, "background=None")
-        shape = tuple(background.shape)
-        expected = f"one colour per view, of shape ({len(cameras)}, 3)"
-        require(
-            shape == (len(cameras), 3), "background", expected=expected, got=shape, example="background=None"
-        )
-        return self._render(cameras, background)
+        return self._render(cameras, torch.zeros(len(cameras), 3) if background is None else background)
 
-    @cached_property
+    @property
     def _render(self) -> RenderFn:
         with logging_messages():
             note_backend(self.rasterizer.prepare(self.gaussians.device))
@@ -208,8 +174,7 @@ class Asset:
 
         Raises ``UserError`` if the settings are wrong or a file cannot be written.
         """
-        require_words(overrides)
-        place = path_text("output", path, 'export("asset.ply")')
+        place = os.fspath(path)
         require_free(overrides, {"output": place, "run": self, "ply": self})
         words = [literal("output", place), *overrides]
         with as_guest(), completing(words):
@@ -228,11 +193,8 @@ class Asset:
         """
         import trimesh
 
-        if unknown := sorted(settings.keys() - {each.name for each in fields(SurfaceSettings)}):
-            known = ", ".join(each.name for each in fields(SurfaceSettings))
-            raise UserError(
-                f"mesh: there is no setting {unknown[0]}, only {known}. Try: mesh(resolution=128)"
-            )
+        for name in settings:
+            require_choice("mesh", name, [each.name for each in fields(SurfaceSettings)])
         exporter: MeshExporter = option(
             "exporter", "mesh", MeshExporter, {name: plain(value) for name, value in settings.items()}
         )
@@ -265,11 +227,6 @@ class Asset:
             temporary.write_text(page, encoding="utf-8")
         print(f"Open this in a browser: {path}")
         return path
-
-
-def _require_cameras(cameras: Cameras) -> None:
-    require_object("cameras", cameras, Cameras, "cameras=None")
-    require(len(cameras) > 0, "cameras", expected="at least one camera", got=0, example="cameras=None")
 
 
 def is_notebook() -> bool:

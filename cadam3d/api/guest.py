@@ -4,7 +4,6 @@ The command line owns its process; a library does not. Everything of the process
 restored here: torch's modes, and where messages go.
 """
 
-import os
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
@@ -16,7 +15,6 @@ from torch import Tensor
 
 from cadam3d.commands.beginning import messages
 from cadam3d.commands.messages import note
-from cadam3d.core.checks import fail
 from cadam3d.core.console import heard_by
 from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import quote
@@ -32,6 +30,8 @@ def as_guest() -> Iterator[None]:
 
     Messages go to the logger ``cadam3d.messages``. Only one thread at a time is in such a block.
     """
+    # Each call says what the user must know about it, even if an earlier one has said the same.
+    note.cache_clear()
     with _turn, logging_messages(), usual_modes():
         yield
 
@@ -39,9 +39,7 @@ def as_guest() -> Iterator[None]:
 @contextmanager
 def logging_messages() -> Iterator[None]:
     """Pass messages on to the logger ``cadam3d.messages`` while the block runs."""
-    # Each call says what the user must know about it, even if an earlier one has said the same.
-    note.cache_clear()
-    with heard_by(_pass_on):
+    with heard_by(lambda text, level: messages.log(level, "%s", text.strip())):
         yield
 
 
@@ -70,36 +68,10 @@ def usual_modes() -> Iterator[None]:
         yield
 
 
-def _pass_on(text: str, level: int) -> None:
-    messages.log(level, "%s", text.strip())
-
-
 def literal(key: str, text: str) -> str:
     """Return the word of a command line that sets ``key`` to exactly ``text``, whatever it contains."""
     is_plain = not QUOTED.fullmatch(text) and "${" not in text and text.lower() != "null"
     return f"{key}={text if is_plain else quote(text)}"
-
-
-def require_object(key: str, value: object, kind: type, example: str) -> None:
-    """Raise ``UserError`` unless ``value`` is an object of class ``kind``."""
-    if not isinstance(value, kind):
-        name = kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__name__}"
-        expected = f"an object of class {name}"
-        raise fail(key, expected=expected, got=value, example=example)
-
-
-def require_words(overrides: tuple[Any, ...]) -> None:
-    """Raise ``UserError`` unless every override is a text."""
-    for override in overrides:
-        require_object("overrides", override, str, '"steps=600"')
-
-
-def path_text(key: str, path: object, example: str) -> str:
-    """Return a path as text. Raises ``UserError`` for anything that cannot be a path."""
-    text = os.fspath(path) if isinstance(path, str | os.PathLike) else None
-    if not isinstance(text, str) or not text or "\0" in text:
-        raise fail(key, expected="a path", got=path, example=example)
-    return text
 
 
 def require_free(overrides: tuple[str, ...], taken: Mapping[str, object]) -> None:

@@ -1,7 +1,7 @@
 """Stepping from Python: a trainer that makes one step per call, with objects in place of components."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, cast
@@ -11,13 +11,13 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from cadam3d.api.asset import Asset
-from cadam3d.api.guest import as_guest, logging_messages, require_object, require_words, usual_modes
+from cadam3d.api.guest import as_guest, logging_messages, usual_modes
 from cadam3d.augmentation import Augmentation
 from cadam3d.background import Background
 from cadam3d.build import build_trainer, component
 from cadam3d.camera.base import CameraSampler
 from cadam3d.commands.beginning import deterministic, load_prior
-from cadam3d.core.checks import require_whole
+from cadam3d.core.checks import fail, require_whole
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.outcome import Outcome
@@ -33,21 +33,6 @@ from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.settings.line import key_of
 from cadam3d.state import RefineReport, StepReport, TrainState
 from cadam3d.trainer import Trainer
-
-# What an object may replace, and the class of the object.
-REPLACEABLE: Mapping[str, type] = {
-    "augmentation": Augmentation,
-    "background": Background,
-    "camera": CameraSampler,
-    "densifier": Densifier,
-    "exposure": Exposure,
-    "guidance": Guidance,
-    "initializer": Initializer,
-    "optimizer": AdamSettings,
-    "prior": DiffusionPrior,
-    "rasterizer": Rasterizer,
-    "refine": Refine,
-}
 
 
 @dataclass(frozen=True)
@@ -126,12 +111,6 @@ class Stepper:
     def _embedding(self) -> PromptEmbedding:
         return self.parts.prior.embed(self.prompt, self.negative_prompt)
 
-    def __repr__(self) -> str:
-        parts = self.parts
-        names = [type(part).__name__ for part in (parts.densifier, parts.guidance, parts.prior)]
-        facts = [f"{self.steps} steps of {parts.views} views", *names, f"seed {self.seed}"]
-        return f"<Stepper {self.prompt!r}: {', '.join(facts)}, on {self.device}>"
-
 
 def compose(  # noqa: PLR0913  (one argument per component)
     *overrides: str,
@@ -155,20 +134,12 @@ def compose(  # noqa: PLR0913  (one argument per component)
 
     Raises ``UserError`` for mistakes, with the texts of the command line.
     """
-    arguments = dict(locals())
-    given = {name: arguments[name] for name in REPLACEABLE if arguments[name] is not None}
-    require_words(overrides)
-    for name, value in given.items():
-        example = f'"{name}={value}"' if isinstance(value, str) else f"{name}=None"
-        require_object(name, value, REPLACEABLE[name], example)
-    for override in overrides:
-        name = key_of(override).partition(".")[0]
-        if name in given:
-            raise UserError(
-                f"{key_of(override)}: expected the object or its settings, got both. "
-                f"Try: compose without {override!r}"
-            )
-        if name == "resume":
+    given = {name: value for name, value in locals().items() if name != "overrides" and value is not None}
+    for word in overrides:
+        key = key_of(word)
+        if key.partition(".")[0] in given:
+            raise fail(key, expected="the object or its settings, not both", got=word, example=f"{key}=null")
+        if key == "resume":
             raise UserError(
                 'resume: only a whole run continues another. Try: cadam3d.train(None, "resume=RUN")'
             )

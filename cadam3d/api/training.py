@@ -9,19 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from cadam3d.api.asset import Asset, load
-from cadam3d.api.guest import (
-    as_guest,
-    literal,
-    path_text,
-    require_free,
-    require_object,
-    require_words,
-)
+from cadam3d.api.guest import as_guest, literal, require_free
 from cadam3d.callback.base import Callback
 from cadam3d.commands.control import StopOnSignal
 from cadam3d.commands.opened import find_run
 from cadam3d.commands.train import optimise
-from cadam3d.io.records import psnr_of, read_config, read_metrics, read_summary
+from cadam3d.io.records import read_config, read_metrics, read_summary
 from cadam3d.io.run_folder import CONFIG, REPORT, RUN_FOLDER, shown
 from cadam3d.launch import completing, prepare
 
@@ -35,7 +28,7 @@ class Run:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         """Open the run in ``folder``. Raises ``UserError`` if the folder does not hold a run."""
-        self.folder: Path = find_run(path_text("folder", folder, 'Run("outputs/latest")'))
+        self.folder: Path = find_run(os.fspath(folder))
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -68,21 +61,17 @@ class Run:
 
     def resume(self, *overrides: str, callbacks: Sequence[Callback] = ()) -> "Run":
         """Continue the run in its folder, with changed settings such as ``"steps=900"``; see ``train``."""
-        require_words(overrides)
         require_free(overrides, {"resume": self.folder})
         return train(None, literal("resume", str(self.folder)), *overrides, callbacks=callbacks)
 
     def __repr__(self) -> str:
         summary = self.summary
         facts = [repr(summary.get("prompt", self.config.get("prompt")))]
-        if {"outcome", "steps", "num_gaussians", "seconds"} <= summary.keys():
-            facts.append(f"{summary['outcome']} after {summary['steps']} steps")
-            facts.append(f"{summary['num_gaussians']:,} Gaussians")
-            facts.append(f"{summary['seconds']:.0f} s")
+        if "outcome" in summary:
+            facts.append(f"{summary['outcome']} after {summary.get('steps')} steps")
+            facts.append(f"{summary.get('num_gaussians')} Gaussians")
         else:
             facts.append("not finished")
-        if (psnr := psnr_of(summary)) is not None:
-            facts.append(f"PSNR {psnr:.2f} dB")
         return f"<Run {shown(self.folder)}: {', '.join(facts)}>"
 
 
@@ -105,11 +94,18 @@ def train(
     notebook, the run saves everything as on the command line, and then ``KeyboardInterrupt`` is raised. A
     second one stops at once. Messages go to the logger ``cadam3d.messages``.
     """
-    words = _words(prompt, overrides, folder)
-    require_object("callbacks", callbacks, Sequence, "callbacks=[]")
-    for callback in callbacks:
-        require_object("callbacks", callback, Callback, "callbacks=[]")
-    stop = StopOnSignal(_signals())
+    named = {} if prompt is None else {"prompt": prompt}
+    named |= {} if folder is None else {RUN_FOLDER: os.fspath(folder)}
+    require_free(overrides, named)
+    # Hydra resolves references in the name of the folder, even quoted ones, so they are not quoted.
+    words = [
+        f"{key}={text}" if key == RUN_FOLDER and "${" in text else literal(key, text)
+        for key, text in named.items()
+    ]
+    words += overrides
+    # Python handles signals in the main thread only.
+    is_main = threading.current_thread() is threading.main_thread()
+    stop = StopOnSignal((signal.SIGINT,) if is_main else ())
     with as_guest(), completing(words):
         cfg, call = prepare("train", words)
         folder, _ = optimise(cfg, call, stop, callbacks)
@@ -118,29 +114,3 @@ def train(
         again = f"cadam3d train {shlex.quote(f'resume={shown(run.folder)}')}"
         raise KeyboardInterrupt(f"Everything is saved. Continue with: {again}")
     return run
-
-
-def _signals() -> tuple[int, ...]:
-    """Return the signals that training may handle; Python handles signals in the main thread only."""
-    is_main = threading.current_thread() is threading.main_thread()
-    return (signal.SIGINT,) if is_main else ()
-
-
-def _words(
-    prompt: str | None, overrides: tuple[str, ...], folder: str | os.PathLike[str] | None
-) -> list[str]:
-    """Return the words of the command line that does the same."""
-    require_words(overrides)
-    named = {}
-    if prompt is not None:
-        require_object("prompt", prompt, str, '"a red cube"')
-        named["prompt"] = prompt
-    if folder is not None:
-        named[RUN_FOLDER] = path_text("folder", folder, 'folder="outputs/mine"')
-    require_free(overrides, named)
-    # Hydra resolves references in the name of the folder, even quoted ones, so they are not quoted.
-    words = [
-        f"{key}={text}" if key == RUN_FOLDER and "${" in text else literal(key, text)
-        for key, text in named.items()
-    ]
-    return [*words, *overrides]

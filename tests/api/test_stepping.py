@@ -131,7 +131,6 @@ def test_a_component_of_the_yaml_and_the_same_object_do_the_same(run):
 
 def test_a_densifier_of_the_caller_decides_what_grows():
     trainer = cadam3d.compose(*SMALL, densifier=First(count=5))
-    assert "First" in repr(trainer)
     state = trainer.start()
     refinements = [step.refinement for step in trainer.run(state) if step.refinement is not None]
     assert [refinement.selected for refinement in refinements] == [5, 5]
@@ -155,7 +154,7 @@ def test_every_component_that_is_given_is_used():
         (
             (),
             {"densifier": "cadam"},
-            r"densifier: expected an object of class .*, got 'cadam'\. Try: \"densifier=cadam\"",
+            r"densifier: expected an object of class Densifier, got 'cadam'\. Try: densifier=",
         ),
         ((), {"densifier": First}, "densifier: expected an object of class"),
         (

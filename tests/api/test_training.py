@@ -170,7 +170,7 @@ def test_an_interrupt_saves_and_the_run_continues_to_the_same_bytes(run, place):
     assert asset_of(whole) == asset_of(run)
 
 
-@pytest.mark.parametrize("name", ["1e3", "1_000", "true", "null"])
+@pytest.mark.parametrize("name", ["1e3", "null"])
 def test_a_folder_has_exactly_the_name_that_was_given(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = cadam3d.train("a cube", *SMALL, "steps=1", "exporter=[]", "metric=[]", folder=name)
@@ -219,18 +219,11 @@ def test_a_prompt_is_needed():
 @pytest.mark.parametrize(
     ("words", "settings", "message"),
     [
-        ((5,), {}, "prompt: expected an object of class str, got 5"),
-        (("a cube", 5), {}, "overrides: expected an object of class str, got 5"),
-        (("a cube",), {"folder": 5}, "folder: expected a path, got 5"),
-        (("a cube",), {"folder": "a\0b"}, "folder: expected a path"),
         (("a cube", "prompt=a cone"), {}, "prompt: expected one value"),
         (("a cube", "hydra.run.dir=b"), {"folder": "a"}, "hydra.run.dir: expected one value"),
         (("a cube", "--cfg", "job"), {}, "in a shell"),
-        (("a cube", "--help"), {}, "in a shell"),
         (("a cube", "-m"), {}, "in a shell"),
         (("a cube", "attempts=2"), {}, "in a shell"),
-        (("a cube",), {"callbacks": [print]}, "callbacks: expected an object of class"),
-        (("a cube",), {"callbacks": Witness()}, "callbacks: expected an object of class"),
     ],
 )
 def test_what_only_python_can_get_wrong_is_refused(words, settings, message, without_type_checks):
