@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import torch
 
-from cadam3d.core.checks import fail, require_choice
+from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.core.memory import is_out_of_memory
 from cadam3d.core.number import Number
@@ -16,8 +16,6 @@ from cadam3d.metric.open_clip import clip_model
 from cadam3d.metric.scoring import Scorer
 from cadam3d.metric.transformer import TransformerFolder, TransformerSource, downloaded, kept, model_facts
 
-# The file of each version in the repository of the authors, xswu/HPSv2.
-FILES = {"v2.0": "HPS_v2_compressed.pt", "v2.1": "HPS_v2.1_compressed.pt"}
 # The files of a CLIP model except its weights, all of which are small.
 SMALL = ("*.json", "*.txt")
 
@@ -37,11 +35,7 @@ class Hps(ClipMetric):
     )
     kind: ClassVar[str] = "hps"
 
-    version: str  # of the file, if the model is an id on the hub: "v2.0" or "v2.1"
     base: str  # a folder or an id, with the configuration, the tokenizer and the preprocessing for a file
-
-    def __post_init__(self) -> None:
-        require_choice(f"{self.node}.version", self.version, tuple(FILES))
 
     def prepare(self) -> None:
         """Find the files of the model, after a download if necessary, and check that they are complete."""
@@ -60,14 +54,15 @@ class Hps(ClipMetric):
 
     def _file(self) -> tuple[Path, str, str | None]:
         """Return the file with the weights, its name in records, and its commit if it is from the hub."""
-        source, name = self.source(), FILES[self.version]
+        source = self.source()
         file = Path(source.model).expanduser()
         if file.is_file():
             return file, source.model, None
-        if source.model.count("/") != 1:
-            raise fail(source.key, expected=f"a file such as {name}, or OWNER/NAME", got=source.model)
-        folder = downloaded(source.key, source.model, source.revision, (name,))
-        return folder / name, f"{source.model}/{name}", folder.name
+        repository, _, name = source.model.rpartition("/")
+        if repository.count("/") != 1:
+            raise fail(source.key, expected="a file, or OWNER/NAME/FILE on the hub", got=source.model)
+        folder = downloaded(source.key, repository, source.revision, (name,))
+        return folder / name, source.model, folder.name
 
 
 def _loaded(

@@ -34,9 +34,7 @@ class Protocol(PictureSettings, ABC):
 
     name: str
     text: str  # what the picture is compared with; {} is the prompt
-    # From the name of a scorer, such as "clip", to the id of a model on the hub and its revision, a commit or
-    # None for the newest.
-    models: Mapping[str, Mapping[str, str | None] | None]
+    models: Mapping[str, str | None]  # from the name of a scorer, such as "clip", to OWNER/NAME@COMMIT
 
     def __post_init__(self) -> None:
         super().__post_init__()

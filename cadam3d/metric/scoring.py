@@ -122,8 +122,7 @@ class ModelMetric(ScoreMetric):
     node: ClassVar[str]  # of the configuration, such as "metric.clip_score"
     kind: ClassVar[str]  # the name of the model in protocols, such as "clip"
 
-    model: str | None  # a folder, or an id on the hub; None = the protocol's
-    revision: str | None  # of an id; None = the protocol's, or the newest of a model that is named here
+    model: str | None  # a folder, or OWNER/NAME or OWNER/NAME@COMMIT on the hub; None = the protocol's
 
     def prepare(self) -> None:
         """Find the files of the model, after a download if necessary, and check that they are complete.
@@ -140,14 +139,13 @@ class ModelMetric(ScoreMetric):
 
     def source(self) -> TransformerSource:
         """Return the place of the model. Raises ``UserError`` if neither metric nor protocol names one."""
-        named = self.protocol.models.get(self.kind) or {}
-        key = f"{self.node}.model"
-        if self.model is not None:
-            return TransformerSource(key, self.model, self.revision)
-        if (model := named.get("id")) is None:
-            raise UserError(f"{key}: protocol={self.protocol.name} names no model for this metric")
-        revision = named.get("revision") if self.revision is None else self.revision
-        return TransformerSource(key, model, revision)
+        named = self.protocol.models.get(self.kind) if self.model is None else self.model
+        if named is None:
+            raise UserError(
+                f"{self.node}.model: protocol={self.protocol.name} names no model for this metric"
+            )
+        model, _, revision = named.partition("@")
+        return TransformerSource(f"{self.node}.model", model, revision or None)
 
 
 def too_long(tokens: int, longest: int) -> tuple[str, ...]:

@@ -21,12 +21,9 @@ SECONDS_PER_ANSWER = 5  # for the estimate on the first screen
 
 def study_id(trials: Sequence[Trial], clips: Sequence[Sequence[bytes]]) -> str:
     """Return the name of a study, which depends on everything that its raters see."""
-    digest = hashlib.sha256(_trials_json(trials).encode())
-    for clip in clips:
-        digest.update(str(len(clip)).encode())
-        for frame in clip:
-            digest.update(hashlib.sha256(frame).digest())
-    return digest.hexdigest()[:ID_LENGTH]
+    hashes = [[hashlib.sha256(frame).hexdigest() for frame in clip] for clip in clips]
+    content = _trials_json(trials) + json.dumps(hashes)
+    return hashlib.sha256(content.encode()).hexdigest()[:ID_LENGTH]
 
 
 def study_page(

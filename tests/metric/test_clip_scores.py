@@ -26,7 +26,7 @@ PROTOCOL = ring(
     elevations_deg=[0.0, 40.0],
     size=48,
     text="a view of {}",
-    models={"clip": {"id": "openai/clip", "revision": "abc"}, "pick": {"id": "one/pick", "revision": None}},
+    models={"clip": "openai/clip@abc"},
 )
 
 
@@ -48,7 +48,7 @@ def measurand():
 @pytest.fixture
 def make(clip_folder):
     def metric(kind, **changes):
-        settings = {"protocol": PROTOCOL, "model": str(clip_folder), "revision": None}
+        settings = {"protocol": PROTOCOL, "model": str(clip_folder)}
         return kind(**settings | changes)
 
     return metric

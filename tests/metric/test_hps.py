@@ -12,11 +12,11 @@ from safetensors.torch import save_file
 from splats import make_gaussians
 
 from cadam3d.core.errors import UserError
-from cadam3d.metric import hps, transformer
+from cadam3d.metric import transformer
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.hps import Hps
 
-PROTOCOL = ring(models={"hps": {"id": "xswu/HPSv2", "revision": None}})
+PROTOCOL = ring(models={"hps": "xswu/HPSv2/HPS_v2_compressed.pt"})
 PICTURES = torch.rand(3, 32, 32, 3, generator=torch.Generator().manual_seed(0))
 
 
@@ -91,7 +91,7 @@ def expected(clip_folder):
 
 
 def metric(**changes):
-    settings = {"protocol": PROTOCOL, "model": None, "revision": None, "version": "v2.0", "base": "one/base"}
+    settings = {"protocol": PROTOCOL, "model": None, "base": "one/base"}
     return Hps(**settings | changes)
 
 
@@ -119,22 +119,20 @@ def test_half_precision_and_safetensors_are_read_too(tmp_path, weights, base, ex
     assert found == pytest.approx(expected, abs=5e-3)
 
 
-@pytest.mark.parametrize("version", ["v2.0", "v2.1"])
-def test_the_version_chooses_the_file_on_the_hub(tmp_path, weights, base, expected, monkeypatch, version):
-    checkpoint(tmp_path, weights).rename(tmp_path / hps.FILES[version])
+def test_the_file_may_be_on_the_hub(tmp_path, weights, base, expected, monkeypatch):
+    name = checkpoint(tmp_path, weights).name
     asked = []
 
-    def download(name, *, allow_patterns, **options):
-        asked.append((name, *allow_patterns))
+    def download(repository, *, allow_patterns, **options):
+        asked.append((repository, *allow_patterns))
         return str(tmp_path)
 
     monkeypatch.setattr("huggingface_hub.snapshot_download", download)
     transformer.downloaded.cache_clear()
-    measured = metric(base=str(base), version=version).measure(MEASURAND)
-    assert asked == [("xswu/HPSv2", hps.FILES[version])]
-    assert measured.details["hps"]["model"] == f"xswu/HPSv2/{hps.FILES[version]}"
-    assert measured.details["hps"]["revision"] == tmp_path.name
-    assert measured.details["hps"]["views"] == pytest.approx(expected, abs=1e-5)
+    record = metric(base=str(base)).measure(MEASURAND).details["hps"]
+    assert asked == [("xswu/HPSv2", name)]
+    assert (record["model"], record["revision"]) == (f"xswu/HPSv2/{name}", tmp_path.name)
+    assert record["views"] == pytest.approx(expected, abs=1e-5)
 
 
 def refusal(**changes):

@@ -24,7 +24,7 @@ CHAT = (
     "{% endfor %}{% endfor %}{% if add_generation_prompt %} ASSISTANT:{% endif %}"
 )
 QUESTION = 'Does this figure show "{}"? Please answer yes or no.'
-PROTOCOL = ring(text="a {}", models={"vqa": {"id": "llava-hf/llava-1.5-7b-hf", "revision": None}})
+PROTOCOL = ring(text="a {}", models={"vqa": "llava-hf/llava-1.5-7b-hf"})
 PICTURES = torch.rand(3, 32, 32, 3, generator=torch.Generator().manual_seed(0)).round()
 
 
@@ -101,7 +101,7 @@ def shares(folder):
 
 
 def metric(folder, **changes):
-    settings = {"protocol": PROTOCOL, "model": str(folder), "revision": None, "question": QUESTION}
+    settings = {"protocol": PROTOCOL, "model": str(folder), "question": QUESTION}
     return Vqa(**settings | {"dtype": "float32"} | changes)
 
 
