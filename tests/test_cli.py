@@ -365,7 +365,7 @@ def test_a_run_on_a_read_only_disk_is_refused_in_one_line(run_folder, type_line,
     monkeypatch.setattr("cadam3d.io.occupied.require_writable", refuse)
     message = type_line("train", f"resume={run_folder}").message
     assert message.startswith("resume: cannot write to outputs/")
-    assert "(Read-only file system). Try: cp -r " in message
+    assert "(Read-only file system). Try: hydra.run.dir=" in message
 
 
 def test_two_runs_in_one_second_do_not_share_a_folder(tmp_path):

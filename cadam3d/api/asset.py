@@ -5,7 +5,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -132,21 +132,14 @@ class Asset:
         look = {"kinds": [kind]} | ({} if background is None else {"background": plain(background)})
         settings: ImagesExporter = option("exporter", "images", ImagesExporter, turn | look)
         if cameras is None:
-            cameras, away = settings.ring(settings.views, settings.elevations_deg[0]), settings.distance
+            cameras = settings.ring(settings.views, settings.elevations_deg[0])
         else:
-            away = float(cameras.positions.norm(dim=-1).mean())
+            settings = replace(settings, distance=float(cameras.positions.norm(dim=-1).mean()))
         subject = Subject(self.gaussians, self._render)
         pictures = []
         for first in range(0, len(cameras), VIEWS_AT_ONCE):
             some = cameras.index(slice(first, first + VIEWS_AT_ONCE))
-            [painted] = paint(
-                subject,
-                some,
-                settings.backgrounds(len(some)),
-                settings.kinds,
-                distance=away,
-                is_transparent=settings.is_transparent,
-            )
+            [painted] = paint(subject, some, settings, settings.kinds)
             pictures.append(to_uint8(painted))
         return np.concatenate(pictures)
 

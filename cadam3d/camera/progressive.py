@@ -36,13 +36,6 @@ class Widening:
         low, high = (self._end(side, widenings) for side in (0, 1))
         return low, high
 
-    def reaches_its_end(self) -> bool:
-        """Return whether each factor leads from its start to its end, or start and end are equal."""
-        return all(
-            start == end or (start - self.about) * (factor - 1) * (end - start) > 0
-            for start, end, factor in zip(self.start, self.end, self.factor, strict=True)
-        )
-
     def _end(self, side: int, widenings: int) -> float:
         start, rest = self.start[side], self.end[side]
         growth = math.exp(min(widenings * math.log(self.factor[side]), LARGEST_LOG)) if widenings else 1.0
@@ -83,7 +76,9 @@ class Progressive(CameraSampler):
             require_interval(f"camera.elevation_deg.{side}", rise, low=-90, high=90)
             require_lens(getattr(self.distance, side), getattr(self.fov_y_deg, side), f".{side}")
         for name in ("azimuth_deg", "elevation_deg", "distance", "fov_y_deg"):
-            _require_widening(f"camera.{name}", getattr(self, name))
+            factor = getattr(self, name).factor
+            is_pair = are_numbers(factor, low=1e-3, high=1e3) and len(factor) == 2
+            require(is_pair, f"camera.{name}.factor", expected="two numbers in [0.001, 1000]", got=factor)
         require_whole("camera.begin", self.begin, low=0)
         require_whole("camera.every", self.every, low=1)
         require_range("camera.gamma", self.gamma, above=0)
@@ -124,13 +119,3 @@ class Progressive(CameraSampler):
         low, high = interval
         side = 2 * torch.rand(views, generator=generator) - 1
         return (low + high) / 2 + (high - low) / 2 * side.sign() * side.abs() ** self.gamma
-
-
-def _require_widening(key: str, value: Widening) -> None:
-    is_factor = are_numbers(value.factor, low=1e-3, high=1e3) and len(value.factor) == 2
-    require(
-        is_factor and value.reaches_its_end(),
-        f"{key}.factor",
-        expected=f"two positive factors that lead from {value.start} to {value.end}",
-        got=value.factor,
-    )

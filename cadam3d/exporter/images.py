@@ -60,17 +60,7 @@ class ImagesExporter(CutoutSettings, PictureExporter):
                     camera = ring.index(slice(view, view + 1))
                     azimuth = round(float(camera.azimuth_deg[0]) % 360)
                     stem = f"{number:03d}_az{azimuth:03d}_el{elevation_deg:+03.0f}"
-                    painted = [
-                        paint(
-                            subject,
-                            camera,
-                            self.backgrounds(1),
-                            self.kinds,
-                            distance=self.distance,
-                            is_transparent=self.is_transparent,
-                        )
-                        for subject in subjects
-                    ]
+                    painted = [paint(subject, camera, self, self.kinds) for subject in subjects]
                     for kind, pictures in zip(self.kinds, zip(*painted, strict=True), strict=True):
                         name = f"{stem}.png" if kind == "rgb" else f"{stem}_{kind}.png"
                         sheet = side_by_side([to_uint8(each[0]) for each in pictures], captions, paper)

@@ -11,6 +11,7 @@ from torch import Tensor
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.mesh.normals import unit_normals, with_normals
+from cadam3d.core.pictures import CutoutSettings
 from cadam3d.core.rendering import RenderFn, Subject
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.caption import PAPER, Caption, Color
@@ -43,22 +44,17 @@ def paper_of(background: Sequence[float] | str) -> Color:
 
 
 def paint(
-    subject: Subject,
-    cameras: Cameras,
-    background: Float[Tensor, "v 3"],
-    kinds: Sequence[str],
-    *,
-    distance: float,
-    is_transparent: bool,
+    subject: Subject, cameras: Cameras, settings: CutoutSettings, kinds: Sequence[str]
 ) -> list[Float[Tensor, "v h w c"]]:
     """Return the pictures of each kind in ``KINDS``: three channels, or four with straight alpha.
 
-    - rgb: the colours over ``background``, which is black for transparent pictures.
-    - depth: closeness, as in ``io/image.py``, over black; ``distance`` is the cameras' distance.
+    - rgb: the colours over the background of the settings, which is black for transparent pictures.
+    - depth: closeness, as in ``io/image.py``, over black.
     - alpha: opacity in grey. It has no transparent parts.
-    - normal: (n + 1) / 2 over ``background``, where n is the unit normal in the axes of normal maps: right,
+    - normal: (n + 1) / 2 over the background, where n is the unit normal in the axes of normal maps: right,
       up, towards the camera.
     """
+    background = settings.backgrounds(len(cameras))
     output = subject.render(cameras, background)
     alpha = output.alpha
     pictures = []
@@ -66,14 +62,14 @@ def paint(
         if kind == "rgb":
             color, over = output.rgb, alpha
         elif kind == "depth":
-            color, over = closeness(output.depth, alpha, distance), alpha
+            color, over = closeness(output.depth, alpha, settings.distance), alpha
         elif kind == "alpha":
             color, over = alpha[..., None].expand_as(output.rgb), torch.ones_like(alpha)
         else:
             color, over = _normals(subject, cameras), alpha
             behind = background.to(color)[:, None, None]
             color = color * alpha[..., None] + (1 - alpha[..., None]) * behind
-        pictures.append(cutout(color, over) if is_transparent else color)
+        pictures.append(cutout(color, over) if settings.is_transparent else color)
     return pictures
 
 

@@ -80,20 +80,10 @@ class TurntableExporter(CutoutSettings, PictureExporter):
         captions, paper = captions_of(subjects), paper_of(self.background)
         for first in range(0, self.views, VIEWS_AT_ONCE):
             some = cameras.index(slice(first, first + VIEWS_AT_ONCE))
-            panels = [to_uint8(self._panel(subject, some)) for subject in subjects]
+            painted = [paint(subject, some, self, self._kinds()) for subject in subjects]
+            panels = [to_uint8(torch.cat(pictures, dim=2)) for pictures in painted]
             for pictures in zip(*panels, strict=True):
                 yield side_by_side(pictures, captions, paper)
 
     def _kinds(self) -> tuple[str, ...]:
         return ("rgb",) if self.beside == "none" else ("rgb", self.beside)
-
-    def _panel(self, subject: Subject, cameras: Cameras) -> torch.Tensor:
-        pictures = paint(
-            subject,
-            cameras,
-            self.backgrounds(len(cameras)),
-            self._kinds(),
-            distance=self.distance,
-            is_transparent=self.is_transparent,
-        )
-        return torch.cat(pictures, dim=2)

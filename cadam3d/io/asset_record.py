@@ -28,14 +28,12 @@ import torch
 from cadam3d import __version__
 from cadam3d.core.errors import UserError
 from cadam3d.io.frames import AXES
-from cadam3d.io.jsonl import is_whole, read_json, write_json
+from cadam3d.io.jsonl import Whole, fits, read_json, write_json
 from cadam3d.io.reading import opened
 from cadam3d.io.records import read_config, read_summary
 from cadam3d.io.run_folder import ASSET_RECORD, CONFIG, numbered, shown
 
 SCHEMA = 1
-LONGEST_TEXT = 10_000  # characters of a prompt
-MOST_FILES = 1000
 CHUNK_BYTES = 1 << 20
 # Entries of the record, and the names under which a summary has them.
 FACTS = {
@@ -99,9 +97,11 @@ def write_record(
     files = {entry.name: asdict(entry) for entry in entries}
     before = _read(path)
     if before is not None and before["source"].get("sha256") == source["sha256"]:
-        for entry in before["files"][:MOST_FILES]:
-            if _is_unchanged(folder, entry):
-                files.setdefault(entry["name"], entry)
+        for entry in before["files"]:
+            # Entries of another form, and of files that have changed, are left out.
+            with suppress(UserError, TypeError, KeyError):
+                if sha256_of(folder / Path(entry["name"]).name) == FileEntry(**entry).sha256:
+                    files.setdefault(entry["name"], entry)
     record = {
         "schema": SCHEMA,
         "source": dict(source),
@@ -116,21 +116,19 @@ def write_record(
 def facts_of(run: Path | None) -> dict[str, Any]:
     """Return what a run states about its training. A stranger may have written it, so values are checked."""
     summary = read_summary(run) if run is not None else {}
-    facts: dict[str, Any] = {name: _plain(summary.get(key)) for name, key in FACTS.items()}
+    stated = {name: summary.get(key) for name, key in FACTS.items()}
     # A run that still trains has no summary. Its configuration names classes, not options.
     if run is not None and not summary:
         with suppress(UserError):
             config = read_config(run / CONFIG)
-            facts |= {name: _plain(config.get(name)) for name in ("prompt", "seed")}
-    return facts | {"trained_with": {name: _plain(summary.get(name)) for name in VERSIONS}}
+            stated |= {name: config.get(name) for name in ("prompt", "seed")}
+    versions = {name: _plain(summary.get(name)) for name in VERSIONS}
+    return {name: _plain(value) for name, value in stated.items()} | {"trained_with": versions}
 
 
-def _plain(value: object) -> str | int | None:
-    """Return a value of a run if it is a text, which is cut, or a whole number; None for anything else."""
-    if isinstance(value, str):
-        # YAML can spell half of a character pair, which no file can hold.
-        return value[:LONGEST_TEXT].encode("utf-8", "replace").decode("utf-8")
-    return value if is_whole(value) else None
+def _plain(value: Any) -> str | int | None:
+    """Return a value of a run if it is a text or a whole number; None for anything else."""
+    return value if fits(value, str | Whole) else None
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -143,17 +141,3 @@ def _read(path: Path) -> dict[str, Any] | None:
         return None
     is_record = isinstance(record.get("source"), dict) and isinstance(record.get("files"), list)
     return record if is_record else None
-
-
-def _is_unchanged(folder: Path, entry: Any) -> bool:
-    """Return whether an entry of an earlier record describes a file in ``folder`` as it is now."""
-    if not isinstance(entry, dict) or entry.keys() != FileEntry.__dataclass_fields__.keys():
-        return False
-    name = entry["name"]
-    if not isinstance(name, str) or Path(name).name != name:
-        return False
-    try:
-        path = folder / name
-        return not path.is_symlink() and sha256_of(path) == entry["sha256"]
-    except UserError:
-        return False

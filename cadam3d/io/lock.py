@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import regular_descriptor
@@ -63,27 +63,35 @@ def take(path: Path) -> IO[bytes] | None:
         file = _inherited(path) or _open(path)
         # Windows does not pass on the lock of the parent process, so there the variable is believed.
         is_passed_on = fcntl is None and INHERITED in os.environ
-        if not is_passed_on and not _lock(file):
-            file.close()
-            return None
+        if not is_passed_on and not try_lock(file.fileno()):
+            # The function is_held may hold the lock for an instant.
+            time.sleep(LOOKING_SECONDS)
+            if not try_lock(file.fileno()):
+                file.close()
+                return None
         # A run that was refused removes its lock file, and locking a removed file has no effect.
         if _is_open_at(file, path):
-            _write_note(file)
+            since = time.strftime("%Y-%m-%d %H:%M:%S")
+            note = f"{process_name()} since {since} ({shlex.join(['cadam3d', *sys.argv[1:]])})"
+            # The lock works without the note, for example on a full disk.
+            with suppress(OSError):
+                file.truncate(0)
+                file.write(note.encode(errors="replace"))
             return file
         file.close()
 
 
-def try_lock(file: IO[Any]) -> bool:
+def try_lock(descriptor: int) -> bool:
     """Lock an open file without waiting. Return False if another process holds its lock.
 
     On a file system without locks this returns True, so the work continues without protection.
     """
     try:
         if fcntl is not None:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         else:
-            os.lseek(file.fileno(), LOCKED_BYTE, os.SEEK_SET)
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
+            os.lseek(descriptor, LOCKED_BYTE, os.SEEK_SET)
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
     # Windows raises PermissionError.
     except (BlockingIOError, PermissionError):
         return False
@@ -92,24 +100,15 @@ def try_lock(file: IO[Any]) -> bool:
     return True
 
 
-def _lock(file: IO[Any]) -> bool:
-    """Lock an open file, and try twice, because :func:`is_held` may hold the lock for an instant."""
-    if try_lock(file):
-        return True
-    time.sleep(LOOKING_SECONDS)
-    return try_lock(file)
-
-
-def unlock(file: IO[Any]) -> None:
+def unlock(descriptor: int) -> None:
     """Release the lock of an open file, even if a child process has inherited the file."""
-    try:
+    # A file system without locks raises OSError.
+    with suppress(OSError):
         if fcntl is not None:
-            fcntl.flock(file, fcntl.LOCK_UN)
+            fcntl.flock(descriptor, fcntl.LOCK_UN)
         else:
-            os.lseek(file.fileno(), LOCKED_BYTE, os.SEEK_SET)
-            msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
-    except OSError:  # a file system without locks
-        pass
+            os.lseek(descriptor, LOCKED_BYTE, os.SEEK_SET)
+            msvcrt.locking(descriptor, msvcrt.LK_UNLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def is_held(path: Path) -> bool:
@@ -125,7 +124,7 @@ def is_held(path: Path) -> bool:
         # A shared lock needs no right to write, so that other users can look too.
         with _open(path, os.O_RDWR if fcntl is None else os.O_RDONLY) as file:
             if fcntl is None:
-                return not try_lock(file)
+                return not try_lock(file.fileno())
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     # Either another process holds the lock, or the file system has no locks, and then the note decides.
     except (OSError, UserError):
@@ -152,25 +151,18 @@ def taking_turns(folder: Path, on_wait: Callable[[], None]) -> Iterator[None]:
     locks on folders, as on Windows, or if the folder cannot be opened, the block runs at once.
     """
     try:
-        descriptor = None if fcntl is None else os.open(folder, os.O_RDONLY)
-    except OSError:
-        descriptor = None
-    if fcntl is None or descriptor is None:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError:  # Windows opens no folders
         yield
         return
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if fcntl is not None and not try_lock(descriptor):
             on_wait()
             fcntl.flock(descriptor, fcntl.LOCK_EX)
-        except OSError:  # a file system without locks
-            pass
         yield
     finally:
         # Closing would not release the lock if a child process had inherited the descriptor.
-        with suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_UN)
+        unlock(descriptor)
         os.close(descriptor)
 
 
@@ -199,15 +191,13 @@ def _open(path: Path, flags: int = os.O_RDWR | os.O_CREAT) -> IO[bytes]:
 
 def _inherited(path: Path) -> IO[bytes] | None:
     """Return the lock file that the parent process has passed on, if it is the file ``path``."""
-    number = os.environ.get(INHERITED, "")
-    if fcntl is None or not number.isdecimal():
-        return None
     try:
         # Closing the copy keeps the lock, because the copy and the original are the same open file.
-        file = os.fdopen(os.dup(int(number)), "r+b", buffering=0)
-    except (OSError, OverflowError, ValueError):
+        file = os.fdopen(os.dup(int(os.environ[INHERITED])), "r+b", buffering=0)
+    except (OSError, OverflowError, ValueError, KeyError):
         return None
-    if _is_open_at(file, path):
+    if fcntl is not None and _is_open_at(file, path):
+        file.seek(0)
         return file
     file.close()
     return None
@@ -219,14 +209,3 @@ def _is_open_at(file: IO[bytes], path: Path) -> bool:
         return os.path.samestat(os.fstat(file.fileno()), os.lstat(path))
     except OSError:
         return False
-
-
-def _write_note(file: IO[bytes]) -> None:
-    """Write into a lock file which process holds it."""
-    since = time.strftime("%Y-%m-%d %H:%M:%S")
-    note = f"{process_name()} since {since} ({shlex.join(['cadam3d', *sys.argv[1:]])})"
-    # The lock works without the note, for example on a full disk.
-    with suppress(OSError):
-        file.truncate(0)
-        file.seek(0)
-        file.write(note.encode(errors="replace"))

@@ -17,12 +17,12 @@ import torch
 from jaxtyping import Float, Int, UInt8
 
 from cadam3d import __version__
-from cadam3d.core.errors import UserError
 from cadam3d.core.mesh.surface import Surface
 from cadam3d.io.atomic import replacing
 from cadam3d.io.frames import points_to_file
 from cadam3d.io.gltf import linear, write_gltf
 from cadam3d.io.ply_tables import header_text
+from cadam3d.io.reading import unusable
 
 FORMATS = ("glb", "obj", "ply")
 # Constants of glTF for the sampling of textures.
@@ -41,31 +41,20 @@ class Texture:
     picture: UInt8[np.ndarray, "h w 3"]  # sRGB
 
 
-@dataclass(frozen=True)
-class _Mesh:
-    """The numbers of a file, in its axes."""
-
-    positions: Float[np.ndarray, "w 3"]
-    normals: Float[np.ndarray, "w 3"]
-    colors: Float[np.ndarray, "w 3"]
-    faces: Int[np.ndarray, "f 3"]
-    texture: Texture | None
-
-
 def write_glb(path: Path, surface: Surface, *, up: str, texture: Texture | None = None) -> None:
     """Write one binary glTF file with an unlit material, atomically.
 
     glTF defines ``+y`` as up; another ``up`` turns the numbers and not the definition. Raises ``UserError``
     if the file cannot be written.
     """
-    mesh = _in_file(surface, up, texture)
-    attributes = {"POSITION": mesh.positions, "NORMAL": mesh.normals}
+    positions, normals, colors = _corners_in_file(surface, up, texture)
+    attributes = {"POSITION": positions, "NORMAL": normals}
     shading: dict[str, object] = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}
     material = {"name": NAME, "pbrMetallicRoughness": shading, "extensions": {UNLIT: {}}}
     entries: dict[str, object] = {"extensionsUsed": [UNLIT], "materials": [material]}
     if texture is None:
         # Four numbers instead of three, because every element has to begin at a multiple of four bytes.
-        rgba = np.concatenate([linear(mesh.colors), np.ones((len(mesh.colors), 1))], axis=1)
+        rgba = np.concatenate([linear(colors), np.ones((len(colors), 1))], axis=1)
         attributes["COLOR_0"] = np.rint(rgba * 65535).astype("<u2")
     else:
         # glTF measures v from the upper edge.
@@ -79,7 +68,7 @@ def write_glb(path: Path, surface: Surface, *, up: str, texture: Texture | None 
         NAME,
         attributes,
         {"material": 0},
-        indices=mesh.faces.reshape(-1, 1).astype("<u4"),
+        indices=(texture or surface).faces.reshape(-1, 1).astype("<u4"),
         picture=b"" if texture is None else _png(texture),
         **entries,
     )
@@ -90,12 +79,12 @@ def write_mesh_ply(path: Path, surface: Surface, *, up: str) -> None:
 
     Raises ``UserError`` if the file cannot be written.
     """
-    mesh = _in_file(surface, up, None)
-    vertex = np.zeros(len(mesh.positions), dtype=[("place", "<f4", 6), ("rgb", "u1", 3)])
-    vertex["place"] = np.concatenate([mesh.positions, mesh.normals], axis=1)
-    vertex["rgb"] = _bytes(mesh.colors)
-    face = np.zeros(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
-    face["count"], face["corners"] = 3, mesh.faces
+    positions, normals, colors = _corners_in_file(surface, up, None)
+    vertex = np.zeros(len(positions), dtype=[("place", "<f4", 6), ("rgb", "u1", 3)])
+    vertex["place"] = np.concatenate([positions, normals], axis=1)
+    vertex["rgb"] = np.rint(colors * 255)
+    face = np.zeros(len(surface.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    face["count"], face["corners"] = 3, surface.faces
     columns = [f"float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
     columns += [f"uchar {name}" for name in ("red", "green", "blue")]
     elements = {"vertex": (len(vertex), columns), "face": (len(face), ["list uchar int vertex_indices"])}
@@ -110,26 +99,27 @@ def write_obj(path: Path, surface: Surface, *, up: str, texture: Texture | None 
     whole or not at all, and the obj comes last, so that it never refers to something that is missing. Raises
     ``UserError`` if a file cannot be written.
     """
-    mesh = _in_file(surface, up, texture)
+    positions, normals, colors = _corners_in_file(surface, up, texture)
+    head, corner, files = [f"# {NAME} {__version__}"], "{0}//{0}", [path]
     if texture is None:
-        lines = _rows("v", np.concatenate([mesh.positions, mesh.colors], axis=1)) + _rows("vn", mesh.normals)
-        lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in (mesh.faces + 1).tolist()]
-        with replacing(path) as temporary:
-            temporary.write_text("\n".join([f"# {NAME} {__version__}", *lines]) + "\n", encoding="ascii")
-        return [path]
-    material, picture = path.with_suffix(".mtl"), path.with_suffix(".png")
-    with replacing(picture) as temporary:
-        temporary.write_bytes(_png(texture))
-    # Colour from the picture alone: white diffuse, no ambient and no highlight (illumination model 1).
-    shading = [f"newmtl {NAME}", "Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "illum 1", f"map_Kd {picture.name}"]
-    with replacing(material) as temporary:
-        temporary.write_text("\n".join(shading) + "\n", encoding="utf-8")
-    lines = _rows("v", mesh.positions) + _rows("vn", mesh.normals) + _rows("vt", texture.uv)
-    lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in (mesh.faces + 1).tolist()]
-    head = [f"# {NAME} {__version__}", f"mtllib {material.name}", f"usemtl {NAME}"]
+        lines = _rows("v", np.concatenate([positions, colors], axis=1)) + _rows("vn", normals)
+    else:
+        material, picture = path.with_suffix(".mtl"), path.with_suffix(".png")
+        files += [material, picture]
+        with replacing(picture) as temporary:
+            temporary.write_bytes(_png(texture))
+        # Colour from the picture alone: white diffuse, no ambient and no highlight (illumination model 1).
+        shading = [f"newmtl {NAME}", "Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "illum 1", f"map_Kd {picture.name}"]
+        with replacing(material) as temporary:
+            temporary.write_text("\n".join(shading) + "\n", encoding="utf-8")
+        head += [f"mtllib {material.name}", f"usemtl {NAME}"]
+        corner = "{0}/{0}/{0}"
+        lines = _rows("v", positions) + _rows("vn", normals) + _rows("vt", texture.uv)
+    corners = ((texture or surface).faces + 1).tolist()
+    lines += ["f " + " ".join(corner.format(number) for number in face) for face in corners]
     with replacing(path) as temporary:
         temporary.write_text("\n".join([*head, *lines]) + "\n", encoding="utf-8")
-    return [path, material, picture]
+    return files
 
 
 def read_mesh(path: Path) -> Any:
@@ -146,27 +136,19 @@ def read_mesh(path: Path) -> Any:
         if len(mesh.faces) == 0:
             raise ValueError("it has no triangles")
     except Exception as error:
-        reason = str(error) or type(error).__name__
-        raise UserError(
-            f"{path}: expected a mesh, got a file that cannot be read ({reason}). Try: another file"
-        ) from error
+        raise unusable(path, f"expected a mesh, got a file that cannot be read ({error!r})") from error
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     return mesh
 
 
-def _in_file(surface: Surface, up: str, texture: Texture | None) -> _Mesh:
-    """Return the numbers of the surface in the axes of a file."""
+def _corners_in_file(surface: Surface, up: str, texture: Texture | None) -> list[Float[np.ndarray, "w 3"]]:
+    """Return positions and normals of the vertices in the axes of a file, and their colours."""
     rows = np.arange(len(surface.vertices)) if texture is None else texture.vertices
-    positions, normals = (
+    turned = [
         points_to_file(torch.from_numpy(vectors[rows]), up).numpy().astype(np.float32)
         for vectors in (surface.vertices, surface.normals)
-    )
-    faces = surface.faces if texture is None else texture.faces
-    return _Mesh(positions, normals, surface.colors[rows], faces, texture)
-
-
-def _bytes(rgb: Float[np.ndarray, "*batch 3"]) -> UInt8[np.ndarray, "*batch 3"]:
-    return np.rint(rgb * 255).astype(np.uint8)
+    ]
+    return [*turned, surface.colors[rows]]
 
 
 def _png(texture: Texture) -> bytes:

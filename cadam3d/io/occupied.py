@@ -45,7 +45,7 @@ def occupied(wanted: Path, *, is_chosen: bool, resume: Path | None) -> Iterator[
             if resume is None and (name := occupant(folder)) is not None:
                 raise UserError(
                     f"{key}: {shown(folder)} holds {name}, which a run would overwrite. "
-                    f"Try: {another_folder(key, folder, shown(numbered(folder)))}"
+                    f"Try: {another_folder(key, shown(numbered(folder)))}"
                 )
             yield folder
         except BaseException as error:
@@ -62,5 +62,5 @@ def occupied(wanted: Path, *, is_chosen: bool, resume: Path | None) -> Iterator[
 
 def in_use(folder: Path, holder: str, key: str) -> UserError:
     """Return the error for a folder in which another process, described by ``holder``, writes."""
-    line = another_folder(key, folder, shown(numbered(folder)))
+    line = another_folder(key, shown(numbered(folder)))
     return UserError(f"{key}: {shown(folder)} is in use by {holder}. Try: {line}")

@@ -31,15 +31,10 @@ MAX_DIGITS = 15  # of a number of rows
 END = re.compile(rb"^end_header\s*?\n", re.MULTILINE)
 # Numpy types without their byte order.
 NUMPY_TYPES = {
-    **dict.fromkeys(["char", "int8"], "i1"),
-    **dict.fromkeys(["uchar", "uint8"], "u1"),
-    **dict.fromkeys(["short", "int16"], "i2"),
-    **dict.fromkeys(["ushort", "uint16"], "u2"),
-    **dict.fromkeys(["int", "int32"], "i4"),
-    **dict.fromkeys(["uint", "uint32"], "u4"),
-    **dict.fromkeys(["float", "float32"], "f4"),
-    **dict.fromkeys(["double", "float64"], "f8"),
-}
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float": "f4", "double": "f8", "float32": "f4", "float64": "f8",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -233,7 +233,7 @@ def _is_metrics(line: dict[str, Any]) -> bool:
 def _is_histogram(line: dict[str, Any]) -> bool:
     names = ("step", "score", "bins_per_decade", "first", "counts", "selected")
     bins = Annotated[int, Ge(1), Le(MOST_BINS)]
-    found = tuple(line.get(name) for name in names)
+    found: Any = tuple(line.get(name) for name in names)
     if not fits(found, tuple[Whole, str, bins, int, list[Whole], list[Whole]]):
         return False
     _, _, per_decade, first, counts, selected = found

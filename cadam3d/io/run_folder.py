@@ -167,7 +167,7 @@ def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:
     processes claim the same name at the same time: a name that exists gets a number. Raises ``UserError``
     with the setting ``key`` if the folder cannot be written.
     """
-    free, number = folder, 1
+    free = folder
     try:
         while True:
             try:
@@ -176,8 +176,7 @@ def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:
             except FileExistsError:
                 if is_chosen:
                     raise
-                number += 1
-                free = folder.with_name(f"{folder.name}-{number}")
+                free = numbered(folder)
         require_writable(free)
     except OSError as error:
         raise not_writable(key, free, error) from error
@@ -186,14 +185,13 @@ def claim(folder: Path, key: str, *, is_chosen: bool) -> Path:
 
 def not_writable(key: str, folder: Path, error: OSError) -> UserError:
     """Return the error for a folder that the setting ``key`` names and that cannot be written."""
-    example = another_folder(key, folder, spare("cadam3d"))
-    return UserError(f"{key}: cannot write to {shown(folder)} ({error.strerror or error}). Try: {example}")
+    problem = f"cannot write to {shown(folder)} ({error.strerror or error})"
+    return UserError(f"{key}: {problem}. Try: {another_folder(key, spare('cadam3d'))}")
 
 
-def another_folder(key: str, folder: Path, free: Path) -> str:
-    """Return what to type to use the folder ``free``: the setting ``key``, or a copy of a run to resume."""
-    copy = f"cp -r {shlex.quote(str(shown(folder)))} {shlex.quote(str(free))}"
-    return copy if key == "resume" else setting_word(key, free)
+def another_folder(key: str, free: Path) -> str:
+    """Return what to type to use the folder ``free``; instead of a run that cannot be resumed, a new one."""
+    return setting_word(RUN_FOLDER if key == "resume" else key, free)
 
 
 def require_writable(folder: Path) -> None:

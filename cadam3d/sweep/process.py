@@ -92,7 +92,7 @@ def _locked(folder: Path, stop: Path) -> Iterator[int | None]:
             yield None if signals else file.fileno()
         finally:
             # Closing the file would not release the lock if the job has left a process behind.
-            unlock(file)
+            unlock(file.fileno())
 
 
 def _empty(folder: Path) -> None:

@@ -145,13 +145,13 @@ def test_the_exported_file_itself_is_never_overwritten(output, run_folder, type_
     assert type_line("export", f"run={run_folder}", f"output={output[:5]}", "exporter=[splat]").code == 0
 
 
-def test_a_run_of_a_stranger_adds_nothing_but_short_texts_and_counts(run_folder, type_line):
+def test_a_run_of_a_stranger_adds_nothing_but_texts_and_counts(run_folder, type_line):
     (run_folder / "summary.json").unlink()
-    settings = {"prompt": "\u202e" + "x" * 100_000, "seed": [1, {"a": 2}]}
+    settings = {"prompt": "\u202e" + "x" * 1000, "seed": [1, {"a": 2}]}
     (run_folder / "config.yaml").write_text(json.dumps(settings))
     assert type_line("export", f"run={run_folder}").code == 0
     record = read_json(run_folder / "exports/asset.json")
-    assert record["prompt"] == ("\u202e" + "x" * 100_000)[:10_000]
+    assert record["prompt"] == settings["prompt"]
     assert record["seed"] is None
     assert record["trained_with"] == {"cadam3d": None, "torch": None}
 

@@ -109,7 +109,7 @@ def test_a_second_run_resume_or_sweep_in_the_folder_of_a_run_names_its_process(t
         holder = f"run is in use by process {first.pid} on {os.uname().nodename} since "
         for words, line in (
             (("train", *SMALL, "hydra.run.dir=run"), "Try: hydra.run.dir=run-2"),
-            (("train", "resume=run"), "Try: cp -r run run-2"),
+            (("train", "resume=run"), "Try: hydra.run.dir=run-2"),
             (("sweep", *SMALL, "seed=0,1", "hydra.sweep.dir=run"), "Try: hydra.sweep.dir=run-2"),
         ):
             message = type_line(*words).message

@@ -83,10 +83,8 @@ def test_histograms_of_another_form_are_left_out(tmp_path, key):
 NOT_JSON = {
     "deep": "[" * 100_000,
     "closed": "[" * 100_000 + "]" * 100_000,
-    "65 levels": "[" * 66 + "]" * 66,
     "a long number": '{"a": ' + "1" * 5000 + "}",
     "a large number": '{"a": 1e999}',
-    "a large whole number": '{"a": ' + "1" * 400 + "}",
     "nan": '{"a": NaN}',
     "infinity": '{"a": -Infinity}',
     "half a pair": '{"a": "\\ud800"}',

@@ -205,7 +205,7 @@ def test_a_lock_ends_with_the_job_even_if_another_process_inherited_it(tmp_path)
         left_behind = subprocess.Popen(["sleep", "60"], pass_fds=(lock,))
     try:
         with (tmp_path / ".lock").open("w") as file:
-            assert try_lock(file)
+            assert try_lock(file.fileno())
     finally:
         left_behind.kill()
         left_behind.wait()
@@ -235,7 +235,8 @@ def test_a_machine_without_unix_locks_and_signals_can_import_every_module():
         "import cadam3d.job, cadam3d.sweep.start, cadam3d.sweep.worker\n"
         "from cadam3d.io.lock import try_lock, unlock\n"
         "file = open(sys.argv[1], 'w')\n"
-        "assert [try_lock(file), try_lock(file), unlock(file), try_lock(file)] == [True, False, None, True]\n"
+        "fd = file.fileno()\n"
+        "assert [try_lock(fd), try_lock(fd), unlock(fd), try_lock(fd)] == [True, False, None, True]\n"
     )
     place = os.devnull
     subprocess.run([PYTHON, "-c", code, place], check=True, cwd=REPOSITORY)

@@ -6,6 +6,7 @@ from cadam3d.core.cameras import turntable
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.mesh.normals import facing_normals, unit_normals
 from cadam3d.core.rendering import Subject
+from cadam3d.exporter.images import ImagesExporter
 from cadam3d.exporter.pictures import paint
 from cadam3d.rasterizer.base import render_fn
 from cadam3d.rasterizer.reference import ReferenceRasterizer
@@ -45,8 +46,16 @@ def test_a_picture_of_a_sphere_is_blue_in_the_middle_red_on_the_right_and_green_
     gaussians, rasterizer = sphere(), ReferenceRasterizer()
     cameras = turntable(2, elevation_deg=0.0, distance=3.0, fov_y_deg=40.0, size=48)
     subject = Subject(gaussians, render_fn(rasterizer, lambda: gaussians))
-    settings = {"distance": 3.0, "is_transparent": True}
-    [pictures] = paint(subject, cameras, torch.zeros(2, 3), ["normal"], **settings)
+    settings = ImagesExporter(
+        views=2,
+        elevations_deg=[0.0],
+        kinds=["normal"],
+        distance=3.0,
+        fov_y_deg=40.0,
+        size=48,
+        background="transparent",
+    )
+    [pictures] = paint(subject, cameras, settings, ["normal"])
     y, x = torch.meshgrid(torch.arange(48) - 23.5, torch.arange(48) - 23.5, indexing="ij")
     radius = 24 * RADIUS / (9 - RADIUS**2) ** 0.5 / torch.tan(torch.deg2rad(torch.tensor(20.0)))
     inside = (x**2 + y**2).sqrt() < 0.8 * radius
