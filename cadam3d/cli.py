@@ -24,6 +24,16 @@ COMMANDS = {  # the purpose of each, and a line to paste
     "study": ("let people compare runs, and evaluate it", "cadam3d study runs=multirun/thresholds"),
     "doctor": ("check this machine, with a hint per failure", "cadam3d doctor"),
 }
+HELP = """\
+cadam3d {version}: a sentence in, 3D Gaussians out
+
+Usage: cadam3d COMMAND [key=value ...]
+
+{commands}
+
+Settings of a command:  cadam3d COMMAND --help
+Settings of an option:  cadam3d train --help densifier=cadam
+Tab completion (bash):  eval "$(cadam3d -sc install=bash)\""""
 HELP_FLAGS = ("--help", "-h", "help")
 COMPLETION_FLAGS = ("--shell-completion", "-sc")
 
@@ -58,7 +68,8 @@ def main() -> None:
 def dispatch(words: Sequence[str]) -> int:
     """Run the command line ``words``, without the program's name, and return the exit code."""
     if not words or words[0] in HELP_FLAGS:
-        print(help_text())
+        commands = [f"  {name:<8}{summary:<50}{example}" for name, (summary, example) in COMMANDS.items()]
+        print(HELP.format(version=__version__, commands="\n".join(commands)))
         return 0
     if words[0] == "--version":
         print(f"cadam3d {__version__}")
@@ -75,37 +86,24 @@ def dispatch(words: Sequence[str]) -> int:
     return launch(words[0], words[1:])
 
 
-def help_text() -> str:
-    """Return the help of the program: one line for each command, and how to get the help of a command."""
-    lines = [
-        f"cadam3d {__version__}: a sentence in, 3D Gaussians out",
-        "",
-        "Usage: cadam3d COMMAND [key=value ...]",
-        "",
-        *(f"  {name:<8}{summary:<50}{example}" for name, (summary, example) in COMMANDS.items()),
-        "",
-        "Settings of a command:  cadam3d COMMAND --help",
-        "Settings of an option:  cadam3d train --help densifier=cadam",
-        'Tab completion (bash):  eval "$(cadam3d -sc install=bash)"',
-    ]
-    return "\n".join(lines)
-
-
 def complete(words: Sequence[str]) -> int:
     """Print tab completions. The command is completed here, and Hydra completes the words after it.
 
     ``-sc install=SHELL`` prints a script for the shell. The script calls ``-sc query=SHELL`` with the line so
     far in ``COMP_LINE``.
     """
-    action, _, shell = words[1].partition("=") if len(words) > 1 else ("", "", "")
+    action, _, shell = "".join(words[1:2]).partition("=")
     if action not in ("install", "uninstall", "query") or shell not in ("bash", "zsh", "fish"):
-        got = words[1] if len(words) > 1 else "nothing"
-        raise UserError(
-            f'-sc: expected install=bash|zsh|fish, got {got}. Try: eval "$(cadam3d -sc install=bash)"'
-        )
+        from cadam3d.core.checks import fail
+
+        example = 'eval "$(cadam3d -sc install=bash)"'
+        raise fail("-sc", expected="install=bash|zsh|fish", got=words[1:], example=example)
     if action == "query":
         line = os.environ.get("COMP_LINE", "")
-        typed = _words(line)[1:]
+        try:
+            typed = shlex.split(line)[1:]
+        except ValueError:  # a quote is still open
+            typed = line.split()[1:]
         is_new_word = line.endswith(" ")
         if not typed or (len(typed) == 1 and not is_new_word):
             start = typed[0] if typed else ""
@@ -125,11 +123,3 @@ def complete(words: Sequence[str]) -> int:
     with contextlib.suppress(Exception):
         run_hydra(command, words)
     return 0
-
-
-def _words(line: str) -> list[str]:
-    """Split a line into words as the shell does, even if it is not complete."""
-    try:
-        return shlex.split(line)
-    except ValueError:  # a quote is still open
-        return line.split()

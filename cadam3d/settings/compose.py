@@ -127,12 +127,8 @@ def _own_hydra(folder: Path) -> Iterator[None]:
         VersionBase.instance().version_base = version
 
 
-def print_nothing(_cfg: DictConfig) -> None:
-    """Do nothing, as the function that Hydra does not call when it prints a page."""
-
-
 def run_hydra(
-    command: str, arguments: Sequence[str], run: Callable[[DictConfig], Any] = print_nothing
+    command: str, arguments: Sequence[str], run: Callable[[DictConfig], Any] = lambda _: None
 ) -> None:
     """Run Hydra's main function on ``arguments`` and the YAML of ``command``.
 
@@ -179,10 +175,8 @@ def register_resolvers() -> None:
 
     It is safe to call this again.
     """
-    OmegaConf.register_new_resolver("cadam3d.copies", copies, replace=True)
-    OmegaConf.register_new_resolver("cadam3d.parts", parts, replace=True)
-    OmegaConf.register_new_resolver("cadam3d.slug", slug, replace=True)
-    OmegaConf.register_new_resolver("cadam3d.span", span, replace=True)
+    for function in (copies, parts, slug, span):
+        OmegaConf.register_new_resolver(f"cadam3d.{function.__name__}", function, replace=True)
 
 
 def parts(count: int, pieces: int, steps: object, least: int = 1) -> int:

@@ -26,6 +26,7 @@ from cadam3d.settings.options import (
     option_names,
     package_of,
     read_option,
+    spelled,
 )
 
 NARROWEST, WIDEST = 60, 120  # characters per line
@@ -84,7 +85,7 @@ class Library:
 
     def summary(self, group: str, name: str) -> str:
         """Return the first sentence of the description of an option."""
-        about = about_of(read_text(option_file(group, name, self.folders)))
+        about = about_of(option_file(group, name, self.folders))
         return SENTENCE_END.split(about.partition("\n")[0], maxsplit=1)[0]
 
     def groups(self, command: str) -> dict[str, Choices]:
@@ -105,8 +106,8 @@ class Library:
         settings: list[Setting] = []
         for path in command_files(name):
             own = {key: value for key, value in read_yaml(path).items() if key not in outside}
-            settings += _settings(own, _words_in(path))
-        return Option(about=about_of(read_text(config_dir() / f"{name}.yaml")), settings=tuple(settings))
+            settings += _settings(own, words_in(path))
+        return Option(about=about_of(config_dir() / f"{name}.yaml"), settings=tuple(settings))
 
     def option(self, group: str, name: str) -> Option:
         """Return an option with all its settings, including the settings of the option that it builds on.
@@ -118,7 +119,7 @@ class Library:
         values.pop("hydra", None)
         bases, choices = _defaults(content)
         chosen = [
-            Setting(key=key, value=_spelled(value), words=self._about_choice(key, value))
+            Setting(key=key, value=spelled(value), words="")
             for key, value in choices.items()
             if key in self.options
         ]
@@ -129,7 +130,7 @@ class Library:
             for key, target in _keys_by_class(values)
         }
         return Option(
-            about=about_of(read_text(path)),
+            about=about_of(path),
             base=next((base for base in bases if "/" not in base), ""),
             settings=(*chosen, *_settings(values, words | self._words(group, name))),
             changed=(*choices, *(each.key for each in changed)),
@@ -142,7 +143,7 @@ class Library:
         for base in _defaults(read_yaml(path))[0]:
             inner, _, option = base.lstrip("/").rpartition("/")
             words |= self._words(inner or group, option)
-        for last, note in _words_in(path).items():
+        for last, note in words_in(path).items():
             key = ".".join([*package_of(group, path), last])
             meaning = words.get(key, "").removesuffix(".")
             words[key] = f"{meaning}. Here: {note}" if meaning and note not in meaning else note
@@ -154,15 +155,11 @@ class Library:
         known: dict[tuple[str, str], str] = {}
         for group, names in self.options.items():
             for path in (option_file(group, name, self.folders) for name in names):
-                words = _words_in(path)
+                words = words_in(path)
                 for key, target in _keys_by_class(read_yaml(path)):
                     if key in words:
                         known.setdefault((target, key.rpartition(".")[2]), words[key])
         return known
-
-    def _about_choice(self, group: str, value: Any) -> str:
-        names = value if isinstance(value, list) else [value]
-        return " ".join(self.summary(group, name) for name in names)
 
 
 def help_text(command: str, overrides: Sequence[str], folders: Sequence[Path]) -> str:
@@ -187,9 +184,9 @@ def help_text(command: str, overrides: Sequence[str], folders: Sequence[Path]) -
     return "\n\n".join(parts or _overview(library, command, groups))
 
 
-def about_of(text: str) -> str:
+def about_of(path: Path) -> str:
     """Return the first comment of a file: paragraphs in one line each, and lines of examples."""
-    lines = [line for line in text.splitlines() if not line.startswith("# @package ")]
+    lines = [line for line in read_text(path).splitlines() if not line.startswith("# @package ")]
     flowing = [""]
     for line in takewhile(lambda line: line.startswith("#"), lines):
         words = line[1:].removeprefix(" ").rstrip()
@@ -201,17 +198,13 @@ def about_of(text: str) -> str:
 
 
 @cache
-def _words_in(path: Path) -> dict[str, str]:
-    return words_of(read_text(path))
-
-
-def words_of(text: str) -> dict[str, str]:
+def words_in(path: Path) -> dict[str, str]:
     """Return the descriptions of the keys in a YAML file by dotted key, without those that have none."""
     found: dict[str, str] = {}
     parents: list[tuple[int, str]] = []  # columns and keys of the dicts around a line
     above: list[str] = []
     is_header = True
-    for line in text.splitlines():
+    for line in read_text(path).splitlines():
         is_header = is_header and line.startswith("#")
         if line.lstrip().startswith("#") and not is_header:
             above.append(line.lstrip("# "))
@@ -264,16 +257,12 @@ def _settings(values: dict[str, Any], words: Mapping[str, str], prefix: str = ""
 
 def _spelled(value: Any) -> str:
     """Return a value as a command line spells it, or the call that builds an object."""
-    if isinstance(value, list):
-        return f"[{','.join(map(_spelled, value))}]"
-    if isinstance(value, dict):
-        name = str(value.get(TARGET, "")).rpartition(".")[2]
-        inner = ", ".join(f"{key}={_spelled(each)}" for key, each in value.items() if key != TARGET)
-        is_short = name and not value[TARGET].startswith(SCHEDULES)
-        return f"{name}({'...' if is_short else inner})"
-    if value is None or isinstance(value, bool):
-        return str(value).lower().replace("none", "null")
-    return str(value) or '""'
+    if not isinstance(value, dict):
+        return spelled(value) or '""'
+    target = str(value.get(TARGET, ""))
+    inner = ", ".join(f"{key}={_spelled(each)}" for key, each in value.items() if key != TARGET)
+    is_short = target and not target.startswith(SCHEDULES)
+    return f"{target.rpartition('.')[2]}({'...' if is_short else inner})"
 
 
 def _overview(library: Library, command: str, groups: dict[str, Choices]) -> list[str]:

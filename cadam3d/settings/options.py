@@ -6,6 +6,7 @@ package. Nothing is composed here.
 """
 
 import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
@@ -93,16 +94,14 @@ def load_class(target: object, key: str) -> type:
 
     Raises ``UserError`` unless it can be imported and is a class that can be built.
     """
-    if not isinstance(target, str):
-        raise UserError(f"{key}: expected the path of a class, got {target!r}. Try: {option_word(key)}")
     try:
-        found = get_object(target)
+        found = get_object(target) if isinstance(target, str) else None
     # A module can raise anything while it is imported.
     except Exception as error:
         reason = (str(error.__cause__ or error).splitlines() or [type(error).__name__])[-1]
         raise UserError(f"{key}: {target} cannot be loaded ({reason}). Try: cadam3d doctor") from error
     if not isclass(found) or isabstract(found):
-        raise UserError(f"{key}: expected the path of a class, got {target!r}. Try: {option_word(key)}")
+        raise fail(key, expected="the path of a class", got=target, example=option_word(key))
     return found
 
 
@@ -140,7 +139,7 @@ def option_word(key: str, command: str = "train") -> str:
     """
     group = key.removesuffix(f".{TARGET}").replace(".", "/")
     if names := option_names(group):
-        return argument(group, default_option(group, command) or names[0])
+        return shlex.quote(f"{group}={spelled(default_option(group, command) or names[0])}")
     return f"~{key}"
 
 
@@ -160,6 +159,7 @@ def example_value(key: str) -> Any:
     raise LookupError(key)
 
 
+@cache
 def example_word(key: str) -> str:
     """Return ``key=value`` with an example, as it is typed into a shell.
 
@@ -169,7 +169,7 @@ def example_word(key: str) -> str:
     if option_names(key.replace(".", "/")):
         return option_word(key)
     try:
-        return argument(key, example_value(key))
+        return shlex.quote(f"{key}={spelled(example_value(key))}")
     except LookupError:
         root = key.partition(".")[0]
         return option_word(root) if option_names(root) else ""
@@ -181,10 +181,13 @@ def with_example(error: UserError) -> UserError:
     return UserError(f"{error} Try: {word}") if word else error
 
 
-def argument(key: str, value: Any) -> str:
-    """Return ``key=value`` as it is typed into a shell, with ``value`` in Hydra's grammar."""
-    text = f"{key}={_grammar(value)}"
-    return f"'{text}'" if any(character in text for character in " [{$(") else text
+def spelled(value: Any) -> str:
+    """Return a plain value in Hydra's grammar of overrides."""
+    if isinstance(value, list):
+        return f"[{','.join(map(spelled, value))}]"
+    if value is None or isinstance(value, bool):
+        return str(value).lower().replace("none", "null")
+    return str(value)
 
 
 def _read(group: str, name: str, folders: Sequence[Path]) -> tuple[list[str], dict[str, Any]]:
@@ -207,22 +210,15 @@ def _read(group: str, name: str, folders: Sequence[Path]) -> tuple[list[str], di
 def _places(key: str) -> Iterator[dict[str, Any]]:
     """Yield the nested values of every YAML file that may have a setting, the likeliest first."""
     yield CHOSEN
-    group, _, rest = key.partition(".")
-    member = rest.partition(".")[0]
-    if not option_names(group):
+    group, member, *_ = [*key.split("."), ""]
+    names, chosen = option_names(group), default_option(group)
+    if not names:
         for path in sorted(config_dir().glob("*.yaml"), key=lambda path: path.stem != "train"):
             yield read_yaml(path)
-    chosen = default_option(group)
-    for name in sorted(option_names(group), key=lambda name: (name != member, name != chosen)):
-        yield _known(group, name)
+    for name in sorted(names, key=lambda name: (name != member, name != chosen)):
+        yield read_option(group, name)
     for name in option_names(f"{group}/{member}"):
-        yield _known(f"{group}/{member}", name)
-
-
-@cache
-def _known(group: str, name: str) -> dict[str, Any]:
-    """Return the values of an option of the package, which do not change."""
-    return read_option(group, name)
+        yield read_option(f"{group}/{member}", name)
 
 
 def _inside(values: Any, parts: Sequence[str]) -> Any:
@@ -232,12 +228,3 @@ def _inside(values: Any, parts: Sequence[str]) -> Any:
             return NOTHING
         values = values[part]
     return values
-
-
-def _grammar(value: Any) -> str:
-    """Return a plain value in Hydra's grammar of overrides."""
-    if isinstance(value, list):
-        return "[" + ",".join(map(_grammar, value)) + "]"
-    if value is None or isinstance(value, bool):
-        return str(value).lower().replace("none", "null")
-    return str(value)

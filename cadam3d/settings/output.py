@@ -6,7 +6,6 @@ from pathlib import Path
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from cadam3d.core.checks import fail
-from cadam3d.core.errors import UserError
 from cadam3d.exporter.base import Exporter, exporters_by_suffix
 from cadam3d.io.run_folder import expanded, setting_word
 from cadam3d.settings.line import is_list, key_of, text_of
@@ -27,8 +26,11 @@ def exporting(overrides: Sequence[str], folders: Sequence[Path] = ()) -> list[st
     given = {key_of(override): override for override in overrides}
     name = text_of(given["output"]) if "output" in given else ""
     named = {key.split(".")[1] for key in given if key.startswith("exporter.")}
-    if "for" in given:
-        _require_target(text_of(given["for"]), is_alone="exporter" not in given)
+    # A setting of an exporter, such as exporter.glb.up=-y, is a deliberate change of what for= chooses.
+    if "for" in given and "exporter" in given:
+        raise fail(
+            "exporter", expected="for= alone, which chooses it", got=given["exporter"], example=given["for"]
+        )
     if "for" in given or not names_file(name):
         is_comparison = is_list(given.get("run", "")) and "exporter" not in given and named <= set(COMPARING)
         return [*overrides, *([f"exporter=[{','.join(COMPARING)}]"] if is_comparison else [])]
@@ -57,14 +59,7 @@ def exporter_classes(folders: Sequence[Path]) -> dict[str, type[Exporter]]:
 
 def names_file(name: str) -> bool:
     """Return whether a value of ``output=`` names a file: it has a suffix and is not a folder that exists."""
-    return bool(Path(name).suffix) and not name.endswith("/") and not _is_folder(expanded(name))
-
-
-def _is_folder(path: Path) -> bool:
-    try:
-        return path.is_dir()
-    except OSError:  # a name that is too long
-        return False
+    return bool(Path(name).suffix) and not name.endswith("/") and not expanded(name).is_dir()
 
 
 def suffix_of(name: str, known: Mapping[str, object]) -> str:
@@ -78,14 +73,3 @@ def _options(override: str) -> set[str]:
     """Return the options that an override chooses."""
     value = OverridesParser.create().parse_override(override).value()
     return set(map(str, value)) if isinstance(value, list) else {str(value)}
-
-
-def _require_target(target: str, *, is_alone: bool) -> None:
-    """Raise ``UserError`` if the line also names an exporter.
-
-    A program decides which exporter is right. A setting of that exporter, such as ``exporter.glb.up=-y``, is
-    a deliberate change and stays.
-    """
-    if not is_alone:
-        expected = f"for={target} alone, which chooses the exporter"
-        raise UserError(f"exporter: expected {expected}, got both. Try: for={target}")

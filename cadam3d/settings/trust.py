@@ -25,6 +25,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
+from cadam3d.core.checks import fail
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import KINDS, read_text, read_yaml
@@ -51,19 +52,16 @@ CONSTANT = "cadam3d.core.schedule.Constant"
 
 def is_trusted(overrides: Sequence[str]) -> bool:
     """Return whether a command line says ``trust=true``. Raises ``UserError`` for other values of it."""
-    value = False
-    for override in overrides:
-        if override.partition("=")[0].lstrip("+") == "trust":
-            value = OverridesParser.create().parse_override(override).value()
+    given = [override for override in overrides if override.partition("=")[0].lstrip("+") == "trust"]
+    value = OverridesParser.create().parse_override(given[-1]).value() if given else False
     if not isinstance(value, bool):
-        raise UserError(f"trust: expected true or false, got {value!r}. Try: trust=false")
+        raise fail("trust", expected="true or false", got=value, example="trust=false")
     return value
 
 
 def read_overrides(path: Path) -> list[str]:
     """Return the overrides that a run was started with. Raises ``UserError`` if ``path`` is no such list."""
-    lines = read_yaml(path)
-    lines = [] if lines is None else lines
+    lines = [] if (content := read_yaml(path)) is None else content
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
         raise UserError(f"{path}: expected a list of key=value, got other data. Try: another run")
     return [line for line in lines if _root(line) not in NOT_REPEATED]
@@ -142,20 +140,16 @@ def require_contained(folder: Path, retry: str | None) -> None:
         for path in (Path(place, name) for name in (*folders, *files)):
             target = Path(os.path.realpath(path))
             if retry is not None and not target.is_relative_to(root):
-                raise UserError(
-                    f"{path}: expected a link to a place in {root.name}, got one to {target}. A command "
-                    f"that writes there would change files elsewhere. Try: {retry}"
-                )
+                expected = f"a link to a place in {root.name}"
+                raise UserError(f"{path}: expected {expected}, got one to {target}. Try: {retry}")
             if path.exists() and not path.is_file() and not path.is_dir():
                 kind = KINDS.get(stat.S_IFMT(path.stat().st_mode), "something else")
                 raise UserError(f"{path}: expected a file, got {kind}. Try: rm {shlex.quote(str(path))}")
 
 
-def _raise_unreadable(error: OSError) -> None:
-    reason = error.strerror or error
-    raise UserError(
-        f"{error.filename}: expected a folder that can be read ({reason}). Try: another folder"
-    ) from error
+def _raise_unreadable(error: OSError) -> NoReturn:
+    expected = f"a folder that can be read ({error.strerror})"
+    raise fail("path", expected=expected, got=error.filename, example="another folder") from error
 
 
 def _lacking(override: Override, folders: tuple[Path, ...]) -> str:
@@ -163,14 +157,17 @@ def _lacking(override: Override, folders: tuple[Path, ...]) -> str:
     key = override.key_or_group
     if override.is_sweep_override():
         return "a single value"
+    groups = {path.name for folder in folders for path in folder.glob("*") if path.is_dir()}
+    known = groups.union(read_yaml(config_dir() / "train.yaml")) - {*MACHINERY, "defaults"}
     # With a package, as in group@package=option, the value would come to another place.
-    is_plain = KEY.fullmatch(key) and override.package is None
-    if not is_plain or _root(key) not in _roots(folders):
+    if not KEY.fullmatch(key) or override.package is not None or _root(key) not in known:
         return "a setting of training"
     value = override.value()
-    is_group = any((folder / key).is_dir() for folder in folders)
-    if is_group and not override.is_delete() and not _are_options(value):
-        return "the name of an option"
+    if any((folder / key).is_dir() for folder in folders) and not override.is_delete():
+        # A name cannot leave the folder of its group.
+        names = value if isinstance(value, list) else [value]
+        if not all(name is None or (isinstance(name, str) and OPTION.fullmatch(name)) for name in names):
+            return "the name of an option"
     node: Any = value
     for part in reversed(re.split(r"[./]", key)):
         node = {part: node}
@@ -187,19 +184,6 @@ def _root(line: str) -> str:
     return re.split(r"[./@=]", line.lstrip("+~"), maxsplit=1)[0]
 
 
-def _roots(folders: Sequence[Path]) -> set[str]:
-    """Return the first parts that the key of a setting of training can have."""
-    own = read_yaml(config_dir() / "train.yaml")
-    groups = {path.name for folder in folders for path in folder.glob("*") if path.is_dir()}
-    return (groups | own.keys()) - {*MACHINERY, "defaults"}
-
-
-def _are_options(value: object) -> bool:
-    """Return whether ``value`` names options. A name cannot leave the folder of its group."""
-    names = value if isinstance(value, list) else [value]
-    return all(name is None or (isinstance(name, str) and OPTION.fullmatch(name)) for name in names)
-
-
 @cache  # a sweep has many runs
 def _known_targets(folders: tuple[Path, ...]) -> frozenset[str]:
     """Return the targets that the YAML files of all groups of components in ``folders`` name."""
@@ -214,10 +198,10 @@ def _unknown(node: Any, folders: tuple[Path, ...]) -> str:
     Keys with an underscore in front, such as ``_args_``, change how Hydra builds an object.
     """
     for key, value in _pairs(node):
-        if key == TARGET and not (isinstance(value, str) and value in _known_targets(folders)):
-            return f"{TARGET}={value}"
-        if not isinstance(key, str) or (key.startswith("_") and key != TARGET):
-            return str(key)
+        if key == TARGET and isinstance(value, str) and value in _known_targets(folders):
+            continue
+        if not isinstance(key, str) or key.startswith("_"):
+            return f"{key}={value}"
     return ""
 
 
@@ -230,14 +214,10 @@ def _pairs(node: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def _refuse(path: Path, found: str, expected: str, retry: str) -> NoReturn:
-    raise UserError(
-        f"{path}: expected {expected}, got {found[:200]!r}. With trust=true, all code that this folder names "
-        f"runs, so use it only if you trust the author of the folder. Try: {retry}"
-    )
+    code = "With trust=true, all code that this folder names runs, so use it only if you trust its author."
+    raise UserError(f"{path}: expected {expected}, got {found[:200]!r}. {code} Try: {retry}")
 
 
 def _note_cache(key: str, path: Path, how: str) -> None:
-    say(
-        f"Note: {key} in {path} is ignored, because code may be loaded from there. To set it, add {how}.",
-        logging.WARNING,
-    )
+    text = f"Note: {key} in {path} is ignored, because code may be loaded from there. To set it, add {how}."
+    say(text, logging.WARNING)

@@ -8,7 +8,7 @@ import pytest
 
 from cadam3d import cli
 from cadam3d.core.errors import UserError
-from cadam3d.settings.help import Library, about_of, help_text, words_of
+from cadam3d.settings.help import Library, about_of, help_text, words_in
 from cadam3d.settings.options import config_dir
 
 REPOSITORY = Path(__file__).parents[2]
@@ -57,14 +57,16 @@ def test_every_setting_and_every_group_of_a_command_has_a_description(command):
 # --- reading comments -------------------------------------------------------------------------------------
 
 
-def test_a_description_is_beside_its_key_or_directly_above_it():
+def test_a_description_is_beside_its_key_or_directly_above_it(tmp_path):
     text = (
         "# What it is.\n_target_: a.B\none: 1 # beside\n\n# a heading\n\n# above,\n# in two lines\n"
         "two: 2\n# Above.\nthree: 3 # and beside\nfive: '#5' # quoted\nsix: [1, 2] # a list\nseven: a#b\n"
         "inner: # a dict\n  eight: 8 # inside\nnine: 9 # outside\n"
     )
-    assert about_of(text) == "What it is."
-    assert words_of(text) == {
+    path = tmp_path / "it.yaml"
+    path.write_text(text)
+    assert about_of(path) == "What it is."
+    assert words_in(path) == {
         "one": "beside",
         "two": "above, in two lines",
         "three": "Above. And beside",
@@ -76,11 +78,14 @@ def test_a_description_is_beside_its_key_or_directly_above_it():
     }
 
 
-def test_the_first_comment_may_have_paragraphs_and_examples_and_belongs_to_no_key():
+def test_the_first_comment_may_have_paragraphs_and_examples_and_belongs_to_no_key(tmp_path):
     text = "# One\n# line.\n#\n#   cadam3d one\n#   cadam3d two\n#\n# Two (sec. 3). Three.\nkey: 1\n"
-    assert about_of(text) == "One line.\n\n  cadam3d one\n  cadam3d two\n\nTwo (sec. 3). Three."
-    assert not words_of(text)
-    assert about_of("# @package callback.mine\n# What it is.\nkey: 1\n") == "What it is."
+    path = tmp_path / "it.yaml"
+    path.write_text(text)
+    assert about_of(path) == "One line.\n\n  cadam3d one\n  cadam3d two\n\nTwo (sec. 3). Three."
+    assert not words_in(path)
+    path.write_text("# @package callback.mine\n# What it is.\nkey: 1\n")
+    assert about_of(path) == "What it is."
 
 
 def test_an_option_inherits_the_descriptions_of_its_base(tmp_path):

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import sys
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -311,12 +312,12 @@ def test_a_payload_in_a_component_that_is_built_is_refused(config, tmp_path):
     places = [
         key for key, _ in flatten({name: config[name] for name in ("prior", "rasterizer")}, with_nodes=True)
     ]
-    for key in places:
-        for payload in ({"_target_": PAYLOAD}, [{"_target_": PAYLOAD}], {"a": [{"_target_": PAYLOAD}]}):
-            cfg = OmegaConf.create(config)
-            OmegaConf.update(cfg, key, payload, merge=False, force_add=True)
-            with pytest.raises(UserError, match=r"config\.yaml: .*Try: "):
-                components_of(OmegaConf.to_container(cfg), tmp_path)
+    payloads = ({"_target_": PAYLOAD}, [{"_target_": PAYLOAD}], {"a": [{"_target_": PAYLOAD}]})
+    for key, payload in zip(places, cycle(payloads), strict=False):
+        cfg = OmegaConf.create(config)
+        OmegaConf.update(cfg, key, payload, merge=False, force_add=True)
+        with pytest.raises(UserError, match=r"config\.yaml: .*Try: "):
+            components_of(OmegaConf.to_container(cfg), tmp_path)
 
 
 @pytest.mark.parametrize(
