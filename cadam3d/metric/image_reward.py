@@ -17,22 +17,16 @@ from cadam3d.core.number import Number
 from cadam3d.io.image import to_uint8
 from cadam3d.io.pretrained import short
 from cadam3d.metric.scoring import ScoreMetric, Scorer, too_long
-from cadam3d.metric.transformer import kept, model_facts
+from cadam3d.metric.transformer import downloaded, kept, model_facts
 
 MODULE, PACKAGE = "ImageReward", "image-reward"
 NAME = "ImageReward-v1.0"
 WEIGHTS, SETTINGS = "ImageReward.pt", "med_config.json"
-# Where the package puts its files, unless it is called with another folder.
-CACHE = Path("~/.cache/ImageReward")
 LONGEST = 35  # tokens that the package reads
-FOLDER = "models/ImageReward"
 # The package does not declare everything that it imports, and some of it must be old.
 INSTALL = "pip install '.[image_reward]' openai-clip torchvision 'setuptools<70' 'transformers<4.56'"
 # The package reads the vocabulary only from the cache of the hub, so it is downloaded there.
-DOWNLOAD = (
-    f"hf download THUDM/ImageReward {WEIGHTS} {SETTINGS} --local-dir {FOLDER} && "
-    f"hf download bert-base-uncased config.json tokenizer.json tokenizer_config.json vocab.txt"
-)
+VOCABULARY = "hf download bert-base-uncased config.json tokenizer.json tokenizer_config.json vocab.txt"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,27 +42,26 @@ class ImageReward(ScoreMetric):
     )
     node: ClassVar[str] = "metric.image_reward"
 
-    model: str | None  # a folder with WEIGHTS and SETTINGS; None = the cache of the package
+    model: str  # a folder with WEIGHTS and SETTINGS, or OWNER/NAME on the hub
 
     def prepare(self) -> None:
         """Import the package, and find the files of the model, after a download if that is necessary."""
         _package()
-        if not (self._folder() / WEIGHTS).is_file():
-            self.scorer(torch.device("cpu"))
+        self._folder()
 
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture a reward."""
         package, folder = _package(), self._folder()
         try:
-            model = kept(_loaded, package, self._name(), folder, device)
+            model = kept(_loaded, package, folder, device)
             facts = model_facts(NAME, None, [folder / WEIGHTS])
         # The package, and the libraries below it, raise almost anything.
         except Exception as error:
             if is_out_of_memory(error):
                 raise
             raise UserError(
-                f"{self.node}.model: no model is available ({short(error)}). Try, with a network connection: "
-                f"{DOWNLOAD}. Then: {self.node}.model={FOLDER}"
+                f"{self.node}.model: the model in {folder} cannot be loaded ({short(error)}). "
+                f"Try, with a network connection: {VOCABULARY}"
             ) from error
         installed = next((each.version for each in distributions(name=PACKAGE)), None)
 
@@ -85,13 +78,12 @@ class ImageReward(ScoreMetric):
             complaints=lambda text: too_long(len(model.blip.tokenizer(text)["input_ids"]), LONGEST),
         )
 
-    def _name(self) -> str:
-        """Return what the package reads: the file of the weights, or NAME, which it downloads."""
-        weights = self._folder() / WEIGHTS
-        return str(weights) if self.model is not None or weights.is_file() else NAME
-
     def _folder(self) -> Path:
-        return (CACHE if self.model is None else Path(self.model)).expanduser()
+        """Return the folder of the model, after a download if it is on the hub and not on this disk."""
+        folder = Path(self.model).expanduser()
+        if (folder / WEIGHTS).is_file():
+            return folder
+        return downloaded(f"{self.node}.model", self.model, None, (WEIGHTS, SETTINGS))
 
 
 def _package() -> Any:
@@ -106,7 +98,7 @@ def _package() -> Any:
         ) from error
 
 
-def _loaded(package: Any, name: str, folder: Path, device: torch.device) -> Any:
-    settings = None if name == NAME else str(folder / SETTINGS)
+def _loaded(package: Any, folder: Path, device: torch.device) -> Any:
+    weights, settings = str(folder / WEIGHTS), str(folder / SETTINGS)
     with redirect_stdout(StringIO()):  # the package prints where it loads from
-        return package.load(name, device=device, download_root=str(folder), med_config=settings)
+        return package.load(weights, device=device, download_root=str(folder), med_config=settings)

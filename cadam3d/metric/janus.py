@@ -62,7 +62,8 @@ class Janus(Metric):
         asset = _features(lambda cameras, background: measurand.render(cameras, background).rgb[None])[0]
         modes = _features(measurand.truth.images)
         # The mode of which each view of the asset resembles some view most.
-        return _by_truth(asset, min(modes, key=lambda mode: float(_differences(asset, mode).mean())))
+        nearest = [torch.cdist(asset, mode).square().min(dim=1).values.mean() for mode in modes]
+        return _by_truth(asset, modes[int(torch.stack(nearest).argmin())])
 
 
 def _by_truth(asset: Float[Tensor, "v p"], true: Float[Tensor, "v p"]) -> Measurement:
@@ -95,11 +96,6 @@ def _by_truth(asset: Float[Tensor, "v p"], true: Float[Tensor, "v p"]) -> Measur
         "janus_fronts": float(fronts),
     }
     return Measurement(numbers, {name: {"value": value, **record} for name, value in numbers.items()})
-
-
-def _differences(asset: Float[Tensor, "v p"], true: Float[Tensor, "v p"]) -> Float[Tensor, "v"]:
-    """Return the squared difference between each view of an asset and the most similar true view."""
-    return torch.cdist(asset, true).square().min(dim=1).values
 
 
 def _by_quarters(counts: Float[Tensor, "v"]) -> Float[Tensor, "v"]:

@@ -18,7 +18,7 @@ from protocols import output, ring
 from splats import make_gaussians
 
 from cadam3d.core.errors import UserError
-from cadam3d.metric import image_reward
+from cadam3d.metric import transformer
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.image_reward import ImageReward
 
@@ -72,7 +72,7 @@ def folder(tmp_path):
 
 
 def metric(model):
-    return ImageReward(protocol=PROTOCOL, model=None if model is None else str(model))
+    return ImageReward(protocol=PROTOCOL, model=str(model))
 
 
 def test_every_view_is_scored_with_the_text_of_the_protocol(package, folder, capsys):
@@ -93,19 +93,17 @@ def test_files_in_a_folder_are_read_without_a_download(package, folder):
     assert package == [(str(folder / "ImageReward.pt"), str(folder), str(folder / "med_config.json"))]
 
 
-def test_without_files_the_package_downloads_them_into_its_cache(package, folder, monkeypatch):
-    cache = folder / "cache"
-    monkeypatch.setattr(image_reward, "CACHE", cache)
+def test_without_a_folder_the_files_come_from_the_hub(package, folder, monkeypatch):
+    asked = []
 
-    def downloaded(*arguments):
-        cache.mkdir(exist_ok=True)
-        (cache / "ImageReward.pt").write_bytes(b"others")
+    def download(name, *, allow_patterns, **options):
+        asked.append((name, *allow_patterns))
+        return str(folder)
 
-    monkeypatch.setattr(image_reward, "_loaded", lambda *arguments: downloaded(package.append(arguments)))
-    metric(None).prepare()
-    facts = metric(None).scorer(torch.device("cpu")).facts
-    assert package[0][1:3] == ("ImageReward-v1.0", cache)
-    assert facts["weights_sha256"] == hashlib.sha256(b"others").hexdigest()
+    monkeypatch.setattr("huggingface_hub.snapshot_download", download)
+    transformer.downloaded.cache_clear()
+    metric("THUDM/ImageReward").prepare()
+    assert asked == [("THUDM/ImageReward", "ImageReward.pt", "med_config.json")]
 
 
 def test_a_long_prompt_is_reported(package, folder):
