@@ -31,7 +31,7 @@ from measuring import in_turns, milliseconds, parser_of, positive, table
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
 from cadam3d.core.errors import UserError
-from cadam3d.prior.shapes.native_tracer import instruction_set, load_tracer, trace_natively
+from cadam3d.prior.shapes.native_tracer import load_tracer, trace_natively
 from cadam3d.prior.shapes.objects import known_objects, known_primitives
 from cadam3d.prior.shapes.scene import PATTERN_NAMES, Scene, build
 from cadam3d.prior.shapes.tracer import Layers, trace
@@ -123,7 +123,9 @@ def main(words: Sequence[str] | None = None) -> None:
         sys.exit(f"bench_tracer: {error}")
     how = f"compiled now in {built.seconds:.1f} s" if built.seconds else "compiled earlier"
     samples = 1 if args.agreement else args.samples
-    print(f"native tracer: {instruction_set(library)}, {how}; {samples} x {samples} rays per pixel\n")
+    library.cadam3d_trace_instructions.restype = ctypes.c_char_p
+    instructions = library.cadam3d_trace_instructions().decode()
+    print(f"native tracer: {instructions}, {how}; {samples} x {samples} rays per pixel\n")
     (compare_images if args.agreement else compare_times)(args, library)
 
 

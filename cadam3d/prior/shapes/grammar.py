@@ -5,12 +5,11 @@ relation = "on" | "under" | "above" | "next to" | "in front of" | "behind" | "an
 phrase   = (article | number | size | colour | "and" | pattern)* noun
 """
 
-import difflib
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-from cadam3d.core.checks import fail
+from cadam3d.core.checks import fail, nearest
 from cadam3d.core.errors import UserError
 from cadam3d.prior.shapes.words import (
     ADJECTIVES,
@@ -161,6 +160,6 @@ def require_words(
     words = sorted(known)
     names = []
     for word in [*dict.fromkeys(unknown)][:MOST_NAMED]:
-        near = difflib.get_close_matches(word, words, n=1, cutoff=SIMILAR)
-        names.append(f"{word!r} (nearest: {near[0]})" if near else repr(word))
+        near = nearest(word, words, least=SIMILAR)
+        names.append(f"{word!r} (nearest: {near})" if near else repr(word))
     raise UserError(f'{key}: expected words of {reader}, got {", ".join(names)}. Try: {key}="{example}"')

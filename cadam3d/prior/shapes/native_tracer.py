@@ -4,11 +4,9 @@ It finds the same hits and the same light as ``tracer.py`` in a small part of th
 """
 
 import ctypes
-from functools import cache
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from cadam3d.compiled.library import SIMD, Build, Names, NativeLibrary, build, load
 from cadam3d.core.cameras import Cameras
@@ -46,12 +44,6 @@ def load_tracer(key: str = "prior.tracer") -> tuple[Build, ctypes.CDLL]:
     return built, load(built)
 
 
-def instruction_set(library: ctypes.CDLL) -> str:
-    """Return the instruction set of the tracer, as for the rasterizer."""
-    library.cadam3d_trace_instructions.restype = ctypes.c_char_p
-    return library.cadam3d_trace_instructions().decode()
-
-
 class _Job(ctypes.Structure):
     """Mirror of ``struct Job`` in kernels/trace.cpp: same order, same types."""
 
@@ -76,7 +68,7 @@ def trace_natively(library: ctypes.CDLL, scene: Scene, cameras: Cameras, samples
     kinds = torch.tensor([KINDS.index(kind) for kind, count in scene.kinds for _ in range(count)])
     tensors = [origins, ray_matrices(fine), local_origins(scene, origins), *ball_limits(scene, origins)]
     tensors += [scene.to_local, scene.sizes, scene.low, scene.high, kinds, scene.patterns, scene.paints]
-    tensors += [*_directions(), alpha, layers]
+    tensors += [light_direction(alpha), sphere_directions(tracer.SPOTS).float(), alpha, layers]
     # The list keeps the copies alive that a tensor with other strides needs.
     tensors = [tensor.contiguous() for tensor in tensors]
     sizes = (*shape, samples, len(scene.radii), scene.albedo.shape[1], torch.get_num_threads())
@@ -84,9 +76,3 @@ def trace_natively(library: ctypes.CDLL, scene: Scene, cameras: Cameras, samples
     if library.cadam3d_trace(ctypes.byref(job)) != 0:
         raise MemoryError(f"prior.tracer=native: not enough memory for {shape[2]} x {shape[1]} pixels")
     return Layers(alpha=alpha, paints=layers)
-
-
-@cache
-def _directions() -> tuple[Tensor, Tensor]:
-    """Return the directions of the light and of the spots."""
-    return light_direction(torch.zeros(())), sphere_directions(tracer.SPOTS).float()

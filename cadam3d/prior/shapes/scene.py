@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 from jaxtyping import Float, Int
@@ -113,7 +114,7 @@ def compile_scene(parts: tuple[Part, ...]) -> Scene:
     reach = torch.stack([part.solid.support(directions) for part in parts])
     # The margin covers points between the finitely many directions.
     radii = (reach - centres @ directions).amax(1) * 1.01
-    matrices = torch.stack([part.solid.matrix for part in parts])
+    matrices, albedo = torch.stack([part.solid.matrix for part in parts]), _albedo(colours)
     return Scene(
         kinds=tuple((kind, kinds.count(kind)) for kind in dict.fromkeys(kinds)),
         to_local=torch.linalg.inv(matrices),
@@ -127,8 +128,8 @@ def compile_scene(parts: tuple[Part, ...]) -> Scene:
         paints=torch.tensor(
             [[colours.index(part.coat.first), colours.index(part.coat.second)] for part in parts]
         ),
-        albedo=_albedo(colours),
-        log_weights=_log_weights(colours),
+        albedo=albedo,
+        log_weights=torch.full((len(albedo),), -math.log(len(albedo)), dtype=torch.float64),
     )
 
 
@@ -149,6 +150,7 @@ def signed_distance(scene: Scene, points: Float[Tensor, "n 3"]) -> Float[Tensor,
     return nearest
 
 
+@cache
 def sphere_directions(count: int) -> Float[Tensor, "count 3"]:
     """Return nearly uniform unit vectors (a Fibonacci lattice)."""
     index = torch.arange(count, dtype=torch.float64) + 0.5
@@ -169,13 +171,9 @@ def _colour(name: str) -> Float[Tensor, "3"]:
     return 0.5 * rgb + 0.5 if shade == "light" else rgb
 
 
-def _modes(colours: list[str]) -> int:
-    """Return the number of modes: one per colour of the palette if a colour is open, else one."""
-    return len(OPEN_PALETTE) if any(name.startswith(OPEN) for name in colours) else 1
-
-
 def _albedo(colours: list[str]) -> Float[Tensor, "m paints 3"]:
-    modes = _modes(colours)
+    """Return the colours of every mode: one mode per colour of the palette if a colour is open, else one."""
+    modes = len(OPEN_PALETTE) if any(name.startswith(OPEN) for name in colours) else 1
 
     def row(mode: int) -> Tensor:
         names = [
@@ -187,11 +185,6 @@ def _albedo(colours: list[str]) -> Float[Tensor, "m paints 3"]:
         return torch.stack([_colour(name) for name in names])
 
     return torch.stack([row(mode) for mode in range(modes)])
-
-
-def _log_weights(colours: list[str]) -> Float[Tensor, "m"]:
-    modes = _modes(colours)
-    return torch.full((modes,), -math.log(modes), dtype=torch.float64)
 
 
 def _paint(item: Thing, phrase: Phrase, index: int) -> tuple[Part, ...]:

@@ -99,29 +99,20 @@ def root(x: Tensor) -> Tensor:
     return x * x.clamp_min(1e-30).rsqrt()
 
 
-# --- ball
+BALL = Kind(
+    "ball",
+    lambda p, size: root(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]) - size[0],
+    lambda d, size: size[0] * d.norm(dim=0),
+    "round",
+)
 
-
-def _ball_sdf(p: Tensor, size: Tensor) -> Tensor:
-    return root(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]) - size[0]
-
-
-def _ball_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
-    return size[0] * d.norm(dim=0)
-
-
-# --- box: half lengths
-
-
-def _box_sdf(p: Tensor, size: Tensor) -> Tensor:
-    return (p.abs() - size[:3]).amax(0)
-
-
-def _box_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
-    return torch.tensor(size, dtype=d.dtype) @ d.abs()
-
-
-# --- frustum about z: bottom radius, top radius, half height (cylinder, cone, disc)
+# Half lengths.
+BOX = Kind(
+    "box",
+    lambda p, size: (p.abs() - size[:3]).amax(0),
+    lambda d, size: torch.tensor(size, dtype=d.dtype) @ d.abs(),
+    "flat",
+)
 
 
 def _frustum_sdf(p: Tensor, size: Tensor) -> Tensor:
@@ -138,7 +129,8 @@ def _frustum_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
     return torch.maximum(bottom * across - half * d[2], top * across + half * d[2])
 
 
-# --- tube about z: outer radius, inner radius, half height
+# About z: bottom radius, top radius, half height (cylinder, cone, disc).
+FRUSTUM = Kind("frustum", _frustum_sdf, _frustum_support, "round")
 
 
 def _tube_sdf(p: Tensor, size: Tensor) -> Tensor:
@@ -148,11 +140,13 @@ def _tube_sdf(p: Tensor, size: Tensor) -> Tensor:
     return torch.maximum(wall, p[2].abs() - half)
 
 
-def _tube_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
-    return size[0] * d[:2].norm(dim=0) + size[2] * d[2].abs()
-
-
-# --- torus about z: ring radius, pipe radius
+# About z: outer radius, inner radius, half height.
+TUBE = Kind(
+    "tube",
+    _tube_sdf,
+    lambda d, size: size[0] * d[:2].norm(dim=0) + size[2] * d[2].abs(),
+    "round",
+)
 
 
 def _torus_sdf(p: Tensor, size: Tensor) -> Tensor:
@@ -160,11 +154,13 @@ def _torus_sdf(p: Tensor, size: Tensor) -> Tensor:
     return root(away * away + p[2] * p[2]) - size[1]
 
 
-def _torus_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
-    return size[0] * d[:2].norm(dim=0) + size[1] * d.norm(dim=0)
-
-
-# --- arc: a torus within an angle of +y, with round ends: ring radius, pipe radius, sine and cosine of it
+# About z: ring radius, pipe radius.
+TORUS = Kind(
+    "torus",
+    _torus_sdf,
+    lambda d, size: size[0] * d[:2].norm(dim=0) + size[1] * d.norm(dim=0),
+    "ring",
+)
 
 
 def _arc_sdf(p: Tensor, size: Tensor) -> Tensor:
@@ -182,7 +178,8 @@ def _arc_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
     return size[0] * (angle.sin() * x + angle.cos() * d[1]) + size[1] * d.norm(dim=0)
 
 
-# --- capsule about z: radius, half length of its axis
+# A torus within an angle of +y, with round ends: ring radius, pipe radius, sine and cosine of the angle.
+ARC = Kind("arc", _arc_sdf, _arc_support, "ring")
 
 
 def _capsule_sdf(p: Tensor, size: Tensor) -> Tensor:
@@ -190,11 +187,13 @@ def _capsule_sdf(p: Tensor, size: Tensor) -> Tensor:
     return root(p[0] * p[0] + p[1] * p[1] + beyond * beyond) - size[0]
 
 
-def _capsule_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
-    return size[0] * d.norm(dim=0) + size[1] * d[2].abs()
-
-
-# --- star: five points in the y-z plane, one up, thick along x: outer radius, inner radius, half thickness
+# About z: radius, half length of its axis.
+CAPSULE = Kind(
+    "capsule",
+    _capsule_sdf,
+    lambda d, size: size[0] * d.norm(dim=0) + size[1] * d[2].abs(),
+    "round",
+)
 
 
 def _star_sdf(p: Tensor, size: Tensor) -> Tensor:
@@ -213,6 +212,10 @@ def _star_support(d: Tensor, size: tuple[float, ...]) -> Tensor:
     angles = 2 * math.pi / STAR_POINTS * torch.arange(STAR_POINTS, dtype=d.dtype)
     tips = size[0] * torch.stack([angles.sin(), angles.cos()], dim=1)
     return (tips @ d[1:]).amax(0) + size[2] * d[0].abs()
+
+
+# Five points in the y-z plane, one up, thick along x: outer radius, inner radius, half thickness.
+STAR = Kind("star", _star_sdf, _star_support, "flat")
 
 
 # --- polytopes: the maximum of their planes; they have no sizes, and only their matrix changes their shape
@@ -236,10 +239,6 @@ def _tetrahedron_sdf(p: Tensor, size: Tensor) -> Tensor:
     return torch.maximum(torch.maximum(sides, rise - p[0] * (2 * _ROOT2 / 3)), -p[2]) - 1 / 3
 
 
-def _octahedron_sdf(p: Tensor, size: Tensor) -> Tensor:
-    return (p[0].abs() + p[1].abs() + p[2].abs() - 1) * (1 / _ROOT3)
-
-
 def _polytope(name: str, sdf: SdfFn, corners: list[list[float]]) -> Kind:
     """Return the kind with this distance and these corners."""
     points = torch.tensor(corners, dtype=torch.float64)
@@ -250,14 +249,6 @@ def _polytope(name: str, sdf: SdfFn, corners: list[list[float]]) -> Kind:
     return Kind(name, sdf, support, "flat")
 
 
-BALL = Kind("ball", _ball_sdf, _ball_support, "round")
-BOX = Kind("box", _box_sdf, _box_support, "flat")
-FRUSTUM = Kind("frustum", _frustum_sdf, _frustum_support, "round")
-TUBE = Kind("tube", _tube_sdf, _tube_support, "round")
-TORUS = Kind("torus", _torus_sdf, _torus_support, "ring")
-ARC = Kind("arc", _arc_sdf, _arc_support, "ring")
-CAPSULE = Kind("capsule", _capsule_sdf, _capsule_support, "round")
-STAR = Kind("star", _star_sdf, _star_support, "flat")
 # A square base of side 2 at z = -1 and an apex at z = 1.
 PYRAMID = _polytope("pyramid", _pyramid_sdf, [[0, 0, 1], [1, 1, -1], [1, -1, -1], [-1, 1, -1], [-1, -1, -1]])
 # A roof: a base of side 2 at z = -1 and a ridge along x at z = 1.
@@ -277,23 +268,10 @@ TETRAHEDRON = _polytope(
 )
 OCTAHEDRON = _polytope(
     "octahedron",
-    _octahedron_sdf,
+    lambda p, size: (p[0].abs() + p[1].abs() + p[2].abs() - 1) * (1 / _ROOT3),
     [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]],
 )
-KINDS = (
-    BALL,
-    BOX,
-    FRUSTUM,
-    TUBE,
-    TORUS,
-    ARC,
-    CAPSULE,
-    STAR,
-    PYRAMID,
-    GABLE,
-    TETRAHEDRON,
-    OCTAHEDRON,
-)
+KINDS = (BALL, BOX, FRUSTUM, TUBE, TORUS, ARC, CAPSULE, STAR, PYRAMID, GABLE, TETRAHEDRON, OCTAHEDRON)
 
 
 # --- constructors: they take full lengths, and the solids are centred on the origin
