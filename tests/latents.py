@@ -19,7 +19,6 @@ KEYS = {
     "noise_levels": "table",
     "dtype": "float32",
     "micro_batch": None,
-    "tiling": False,
     "compile": False,
     "text_device": "auto",
 }

@@ -102,7 +102,6 @@ class LatentPrior(DiffusionPrior):
     noise_levels: str  # one of LEVELS
     dtype: str  # auto or one of DTYPES
     micro_batch: int | None  # images
-    tiling: bool
     compile: bool
     text_device: str  # auto or cpu
     cache_dir: str | None  # folder
@@ -295,10 +294,7 @@ class LatentPrior(DiffusionPrior):
     @cached_property
     def vae(self) -> Any:
         """Return the autoencoder, frozen and on the device."""
-        vae = self.found.part("vae", self._vae_dtype)
-        if self.tiling:
-            vae.enable_tiling()
-        return vae.to(self.device)
+        return self.found.part("vae", self._vae_dtype).to(self.device)
 
     @cached_property
     def network(self) -> Any:

@@ -164,7 +164,7 @@ def test_the_page_of_a_variant_lists_what_it_changes():
     text = page("prior=sdxl")
     assert "Builds on prior=stable_diffusion and changes ids, size." in text
     assert "prior.size=1024" in text
-    assert "prior.tiling=false" in text
+    assert "prior.compile=false" in text
 
 
 def test_the_name_of_a_group_lists_its_options():

@@ -59,15 +59,6 @@ class Layers:
 
 
 @dataclass(frozen=True)
-class _Hits:
-    """The visible points, sorted by part."""
-
-    ray: Int[Tensor, "n"]
-    part: Int[Tensor, "n"]
-    local: Float[Tensor, "3 n"]  # position in local coordinates
-
-
-@dataclass(frozen=True)
 class _Rays:
     """Rays of all views that hit the bounding ball of the scene, sorted by view."""
 
@@ -82,9 +73,9 @@ class _Rays:
 def trace(scene: Scene, cameras: Cameras, samples: int) -> Layers:
     """Render with ``samples`` x ``samples`` rays per pixel, on the device and in the dtype of the cameras."""
     rays = _cast(cameras, samples)
-    hits = _first_hits(scene, rays)
-    light, paint = _shade(scene, hits)
-    pixel, share = rays.pixels[hits.ray], 1.0 / samples**2
+    ray, part, local = _first_hits(scene, rays)
+    light, paint = _shade(scene, part, local)
+    pixel, share = rays.pixels[ray], 1.0 / samples**2
     shape = (len(cameras), cameras.height, cameras.width)
     count, paints = math.prod(shape), scene.albedo.shape[1]
     alpha = light.new_zeros(count).index_add_(0, pixel, torch.full_like(light, share))
@@ -149,8 +140,8 @@ def _candidates(scene: Scene, rays: _Rays) -> tuple[Int[Tensor, "n"], Int[Tensor
     return part, ray
 
 
-def _first_hits(scene: Scene, rays: _Rays) -> _Hits:
-    """Return the first hit of every ray that hits a part."""
+def _first_hits(scene: Scene, rays: _Rays) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"], Float[Tensor, "3 n"]]:
+    """Return each ray that hits a part, the part, and the point in its local coordinates, sorted by part."""
     part, ray = _candidates(scene, rays)
     # The same rays in the local coordinates of the parts. The ray parameter stays in world units.
     start = local_origins(scene, rays.origins).flatten(0, 1).T
@@ -174,7 +165,7 @@ def _first_hits(scene: Scene, rays: _Rays) -> _Hits:
     winner = torch.full_like(rays.views, -1).scatter_reduce_(0, ray[first], first, "amax")
     chosen = winner[winner >= 0].sort().values
     point = origin.index_select(1, chosen) + reached[chosen] * direction.index_select(1, chosen)
-    return _Hits(ray=ray[chosen], part=part[chosen], local=point)
+    return ray[chosen], part[chosen], point
 
 
 def _matrices(scene: Scene, part: Int[Tensor, "n"]) -> Float[Tensor, "3 3 n"]:
@@ -231,29 +222,29 @@ def _runs(scene: Scene, part: Tensor) -> list[tuple[Kind, slice]]:
 # --- light and paint
 
 
-def _shade(scene: Scene, hits: _Hits) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
+def _shade(scene: Scene, part: Tensor, local: Tensor) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
     """Return the light in [0, 1] and the paint of every visible point."""
-    sizes = scene.sizes.T.index_select(1, hits.part)
-    normal = torch.empty_like(hits.local)
-    for kind, rows in _runs(scene, hits.part):
-        normal[:, rows] = _gradient(kind, hits.local[:, rows], sizes[:, rows])
+    sizes = scene.sizes.T.index_select(1, part)
+    normal = torch.empty_like(local)
+    for kind, rows in _runs(scene, part):
+        normal[:, rows] = _gradient(kind, local[:, rows], sizes[:, rows])
     # A normal is mapped to the world by the transposed inverse of the matrix that maps points.
-    normal = _unit(_dot(_matrices(scene, hits.part), normal[:, None]))
+    normal = _unit(_dot(_matrices(scene, part), normal[:, None]))
     light = light_direction(normal)
     facing = ((_dot(light, normal) + WRAP) / (1 + WRAP)).clamp_min(0)
     sent = AMBIENT + SKY * (0.5 + 0.5 * normal[2]) + DIFFUSE * facing
 
-    is_second = torch.zeros_like(hits.part, dtype=torch.bool)
-    pattern = scene.patterns[hits.part]
-    for kind, rows in _runs(scene, hits.part):
+    is_second = torch.zeros_like(part, dtype=torch.bool)
+    pattern = scene.patterns[part]
+    for kind, rows in _runs(scene, part):
         for index, name in enumerate(PATTERN_NAMES):
             chosen = (pattern[rows] == index).nonzero()[:, 0] + rows.start
             if index == 0 or len(chosen) == 0:
                 continue
-            part = hits.part[chosen]
-            box = ((scene.high + scene.low) / 2).T[:, part], ((scene.high - scene.low) / 2).T[:, part]
-            is_second[chosen] = _paint_second(kind, name, hits.local[:, chosen], sizes[:, chosen], box)
-    return sent, torch.where(is_second, scene.paints[hits.part, 1], scene.paints[hits.part, 0])
+            own = part[chosen]
+            box = ((scene.high + scene.low) / 2).T[:, own], ((scene.high - scene.low) / 2).T[:, own]
+            is_second[chosen] = _paint_second(kind, name, local[:, chosen], sizes[:, chosen], box)
+    return sent, torch.where(is_second, scene.paints[part, 1], scene.paints[part, 0])
 
 
 def light_direction(like: Tensor) -> Float[Tensor, "3"]:
