@@ -6,15 +6,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from latents import (
-    KEYS,
-    computes_in_sixteen_bits,
-    encodes_like_the_autoencoder,
-    memory_is_estimated,
-    micro_batch_changes_nothing,
-    normal,
-)
+from latents import KEYS, micro_batch_changes_nothing, normal
 from ldm_names import single_file, unet_names
+from safetensors.torch import save_file
 from torch.nn.functional import normalize
 
 from cadam3d.camera.multiview import Multiview
@@ -151,20 +145,11 @@ def test_the_camera_of_a_view_changes_its_prediction(prior):
     assert (one - other).abs().max() > 1e-3
 
 
-def test_latents_are_those_of_the_autoencoder(prior, pipe):
-    encodes_like_the_autoencoder(prior, pipe.vae)
-
-
 def test_micro_batch_does_not_change_results(prior):
     micro_batch_changes_nothing(prior, size=4, condition=condition_of(prior, views(8)), channels=4)
 
 
-def test_networks_compute_in_16_bits_and_return_float32(prior):
-    computes_in_sixteen_bits(prior, lambda each: condition_of(each, views()))
-
-
-def test_memory_is_estimated(prior):
-    memory_is_estimated(prior, views=4)
+def test_memory_is_estimated_for_whole_groups_only(prior):
     with pytest.raises(UserError, match=r"^views: expected a multiple of 4"):
         prior.memory("a corgi", "", 2, None)
 
@@ -207,18 +192,15 @@ def is_the_same(one, other):
     torch.testing.assert_close(*guesses, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("suffix", [".pt", ".safetensors"])
-def test_one_published_file_is_the_same_model(prior, pipe, folder, file, tmp_path, suffix):
-    path = file
-    if suffix == ".safetensors":
-        from safetensors.torch import save_file
-
-        path = tmp_path / "model.safetensors"
-        save_file({k: v.contiguous().clone() for k, v in torch.load(file).items()}, path)
-    one = replace(prior, path=str(path), tokenizer=str(folder / "tokenizer"))
+def test_one_published_file_is_the_same_model(prior, folder, file, tmp_path):
+    one = replace(prior, path=str(file), tokenizer=str(folder / "tokenizer"))
     is_the_same(one, prior)
     assert prior.noise_path == one.noise_path
-    assert {p.dtype for p in replace(one, dtype="bfloat16").network.parameters()} == {torch.bfloat16}
+    safe = tmp_path / "model.safetensors"
+    save_file({k: v.contiguous().clone() for k, v in torch.load(file).items()}, safe)
+    network = replace(one, path=str(safe), dtype="bfloat16").network
+    for mine, half in zip(one.network.parameters(), network.parameters(), strict=True):
+        assert torch.equal(mine.bfloat16(), half)
 
 
 def test_the_tokenizer_of_one_file_pads_as_it_was_trained(prior, file, folder):

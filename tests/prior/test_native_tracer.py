@@ -95,14 +95,16 @@ def test_every_kind_equals_torch(pattern: str, samples: int, library) -> None:
     assert sum(changed) <= (0 if pattern == "plain" else 2)
 
 
-@pytest.mark.parametrize("pattern", PATTERN_NAMES)
-def test_every_object_equals_torch(pattern: str, library) -> None:
-    changed = 0
+def test_every_object_equals_torch(library) -> None:
+    changed = []
     for number, name in enumerate((*known_primitives(), *known_objects())):
-        view = views(elevation_deg=(-40.0, 10.0, 65.0)[number % 3])
+        view = views(1, elevation_deg=(-40.0, 10.0, 65.0)[number % 3])
+        pattern = PATTERN_NAMES[number % len(PATTERN_NAMES)]
         scene = build_scene(f"a {pattern} {name}")
-        changed += changed_pixels(trace_natively(library, scene, view, 2), trace(scene, view, 2))
-    assert changed <= (0 if pattern == "plain" else 2)
+        pixels = changed_pixels(trace_natively(library, scene, view, 2), trace(scene, view, 2))
+        changed.append(pixels)
+        assert pattern != "plain" or pixels == 0
+    assert sum(changed) <= 2
 
 
 def sentence(rng: random.Random) -> str:
@@ -124,7 +126,7 @@ def sentence(rng: random.Random) -> str:
 
 def test_random_sentences_equal_torch(library) -> None:
     rng, changed = random.Random(0), 0
-    for _ in range(12):
+    for _ in range(6):
         scene = build_scene(sentence(rng))
         changed += changed_pixels(trace_natively(library, scene, views(1), 3), trace(scene, views(1), 3))
     assert changed <= 2
@@ -147,12 +149,9 @@ def camera(distance: float, fov_y_deg: float, **changes: int) -> Cameras:
         pytest.param(camera(3.0, 150.0), id="wide angle"),
     ],
 )
-@pytest.mark.parametrize("prompt", ["a red sphere", "a robot next to a striped tree"])
-def test_every_camera_equals_torch(view: Cameras, prompt: str, library) -> None:
-    scene = build_scene(prompt)
-    for samples in (1, 3):
-        expected = trace(scene, view, samples)
-        assert changed_pixels(trace_natively(library, scene, view, samples), expected) == 0
+def test_every_camera_equals_torch(view: Cameras, library) -> None:
+    scene = build_scene("a robot next to a striped tree")
+    assert changed_pixels(trace_natively(library, scene, view, 3), trace(scene, view, 3)) == 0
 
 
 def test_a_camera_that_looks_away_sees_nothing(library) -> None:
@@ -235,14 +234,6 @@ def test_a_failed_build_is_tried_once(no_compiler, monkeypatch) -> None:
     for _ in range(3):
         tracer_for("auto", views())
     assert len(calls) == 1
-
-
-@needs_compiler
-def test_both_tracers_give_the_same_mixture() -> None:
-    scene, background = build_scene("a robot"), torch.tensor([[1.0, 1.0, 1.0], [0.2, 0.5, 0.8]])
-    ours, expected = (shapes(name).mixture(scene, views(), background) for name in ("native", "torch"))
-    torch.testing.assert_close(ours.means, expected.means, rtol=0, atol=1e-5)
-    assert torch.equal(ours.variance, expected.variance)
 
 
 # --- planted mistakes

@@ -194,10 +194,3 @@ def test_repulsion_acts_across_the_prompt_only():
         across = torch.eye(len(d)).double() - torch.outer(d, d) / d.square().sum()
         wanted = sum(strengths[view, i] * across @ (others[i] - negative)[view].flatten() for i in range(2))
         torch.testing.assert_close(extra[view], wanted)
-
-
-def test_the_component_along_the_prompt_is_not_repelled():
-    negative, positive = random(1, 3, 4, 4), random(1, 3, 4, 4, seed=1)
-    along = negative + 3 * (positive - negative)
-    guided = guide(negative, positive, [along], -torch.ones(1, 1).double(), 5.0)
-    torch.testing.assert_close(guided, negative + 5 * (positive - negative))

@@ -4,15 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from latents import (
-    KEYS,
-    computes_in_sixteen_bits,
-    condition_of,
-    encodes_like_the_autoencoder,
-    memory_is_estimated,
-    micro_batch_changes_nothing,
-    normal,
-)
+from latents import KEYS, computes_in_sixteen_bits, condition_of, normal
 
 from cadam3d.prior.sdxl import StableDiffusionXL
 
@@ -81,20 +73,8 @@ def test_a_prediction_equals_that_of_the_pipelines_parts(prior, pipe):
     torch.testing.assert_close(guess.clean, (noisy - (1 - a**2) ** 0.5 * expected) / a, rtol=1e-4, atol=1e-4)
 
 
-def test_latents_are_those_of_the_pipelines_autoencoder(prior, pipe):
-    encodes_like_the_autoencoder(prior, pipe.vae)
-
-
 def test_networks_compute_in_16_bits_and_return_float32(prior):
     computes_in_sixteen_bits(prior, condition_of)
-
-
-def test_memory_is_estimated(prior):
-    memory_is_estimated(prior)
-
-
-def test_micro_batch_does_not_change_results(prior):
-    micro_batch_changes_nothing(prior, size=1, condition=condition_of(prior), channels=4)
 
 
 @pytest.mark.parametrize(

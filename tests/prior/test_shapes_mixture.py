@@ -48,7 +48,7 @@ def at(path: NoisePath, t: float, views: int = 1) -> tuple[Tensor, Tensor, Tenso
 
 
 @pytest.mark.parametrize("path", PATHS)
-@pytest.mark.parametrize("t", [0.1, 0.4, 0.7, 0.95])
+@pytest.mark.parametrize("t", [0.1, 0.7])
 def test_posterior_mean_equals_monte_carlo(path: NoisePath, t: float) -> None:
     """Weight samples of the prior by the likelihood of the noisy image, without a formula of the mixture."""
     generator = torch.Generator().manual_seed(0)
@@ -154,10 +154,9 @@ def test_ode_sampling_recovers_the_distribution(path: NoisePath) -> None:
     check_recovered(x)
 
 
-@pytest.mark.parametrize("path", PATHS)
-def test_ancestral_sampling_recovers_the_distribution(path: NoisePath) -> None:
+def test_ancestral_sampling_recovers_the_distribution() -> None:
     """The sampler of DDPM draws from the posterior q(x_s | x_t, clean), with new noise at each step."""
-    count, generator = 3000, torch.Generator().manual_seed(4)
+    path, count, generator = DDPM(), 3000, torch.Generator().manual_seed(4)
     times = torch.linspace(1, 0, 301, dtype=torch.float64) ** 2
     mixture = small(count)
     _, a, b = at(path, 1.0, count)

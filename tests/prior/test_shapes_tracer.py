@@ -47,25 +47,19 @@ def expected_light(normal: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("prompt", [*known_primitives(), *known_objects(), *PROMPTS])
-def test_every_scene_fills_the_ball_and_stays_in_it(prompt: str) -> None:
+def test_every_scene_fills_the_ball_and_is_seen_from_all_sides(prompt: str) -> None:
     parts = assemble(parse(prompt))
     directions = sphere_directions(2000).T
     reach = torch.stack([part.solid.support(directions) for part in parts]).amax(0)
     assert 0.97 * FIT_RADIUS < float(reach.max()) < 1.02 * FIT_RADIUS
-
-
-@pytest.mark.parametrize("prompt", [*known_primitives(), *known_objects(), *PROMPTS])
-def test_every_scene_is_seen_from_all_sides_and_never_clipped(prompt: str) -> None:
-    _, layers = look(prompt)
+    layers = trace(compile_scene(parts).to(torch.device("cpu"), torch.float32), cameras(32, 2), 1)
     coverage = layers.alpha.mean(dim=(1, 2))
     assert bool(((coverage > 0.02) & (coverage < 0.80)).all())
     border = torch.cat([layers.alpha[:, [0, -1]].flatten(), layers.alpha[:, :, [0, -1]].flatten()])
     assert float(border.max()) == 0.0
 
 
-@pytest.mark.parametrize(
-    "prompt", ["lighthouse", "mug", "star", "arch", "tetrahedron", "ring", *PROMPTS[1:3]]
-)
+@pytest.mark.parametrize("prompt", ["mug", "star", "arch", "tetrahedron", PROMPTS[2]])
 def test_silhouette_equals_brute_force(prompt: str) -> None:
     """A pixel is covered if and only if one of many points along its ray is inside a solid."""
     parts = assemble(parse(prompt))
@@ -80,7 +74,7 @@ def test_silhouette_equals_brute_force(prompt: str) -> None:
     assert float(((layers.alpha > 0) & ~walked).double().mean()) < 0.01
 
 
-@pytest.mark.parametrize("prompt", ["a rocket", "a hammer next to a tree", "a tall chair"])
+@pytest.mark.parametrize("prompt", ["a rocket", "a hammer next to a tall chair"])
 def test_picture_equals_brute_force(prompt: str) -> None:
     """Find the first point inside a solid by small steps and bisection, and its normal by autograd."""
     parts = assemble(parse(prompt))
