@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from cadam3d.core.checks import require
+from cadam3d.core.checks import require_choice
 from cadam3d.core.pictures import CutoutSettings
 from cadam3d.core.rendering import Subject
 from cadam3d.exporter.pictures import KINDS, PictureExporter, captions_of, paint, paper_of
@@ -37,16 +37,8 @@ class ImagesExporter(CutoutSettings, PictureExporter):
         super().__post_init__()
         self.require_views(self.views)
         self.require_angles("elevations_deg", self.elevations_deg, limit=90)
-        is_list = not isinstance(self.kinds, str) and isinstance(self.kinds, Sequence)
-        require(
-            is_list
-            and 0 < len(self.kinds) == len(set(map(str, self.kinds)))
-            and set(self.kinds) <= set(KINDS),
-            "exporter.images.kinds",
-            expected=f"one or more of {'|'.join(KINDS)}, each once",
-            got=self.kinds,
-            example="'exporter.images.kinds=[rgb,normal]'",
-        )
+        for kind in self.kinds:
+            require_choice("exporter.images.kinds", kind, KINDS)
 
     def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
         """Render and write view by view, so that memory does not grow with the number of views."""

@@ -71,9 +71,9 @@ def load_checkpoint(path: Path) -> Any:
         _require_plain(content)
         if (content["format"], content["version"]) != (FORMAT, VERSION):
             raise ValueError(f"its version is not {VERSION}, which this cadam3d reads")
+        return content["payload"]
     except Exception as error:
         raise DamagedCheckpointError(path, error) from error
-    return content["payload"]
 
 
 def latest_checkpoint(

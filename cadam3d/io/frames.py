@@ -90,33 +90,23 @@ def _permute(vectors: Float[Tensor, "n 3"], axes: Float[Tensor, "3 3"]) -> Float
 def _rotate(gaussians: Gaussians, axes: Float[Tensor, "3 3"]) -> Gaussians:
     if torch.equal(axes, torch.eye(3, dtype=axes.dtype)):
         return gaussians
-    old_axis = axes.abs().argmax(dim=1)
-
-    def permute(vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        return _permute(vectors, axes)
-
+    degrees = range(gaussians.sh_degree + 1)
+    bands = [gaussians.sh[:, degree**2 : (degree + 1) ** 2] for degree in degrees]
     return Gaussians(
-        means=permute(gaussians.means),
-        log_scales=gaussians.log_scales[:, old_axis.to(gaussians.device)],
-        quats=torch.cat([gaussians.quats[:, :1], permute(gaussians.quats[:, 1:])], dim=1),
+        means=_permute(gaussians.means, axes),
+        log_scales=gaussians.log_scales[:, axes.abs().argmax(dim=1).to(gaussians.device)],
+        quats=torch.cat([gaussians.quats[:, :1], _permute(gaussians.quats[:, 1:], axes)], dim=1),
         opacity_logits=gaussians.opacity_logits,
-        sh=torch.cat([_rotate_band(band, permute, axes) for band in _bands(gaussians.sh)], dim=1),
+        sh=torch.cat([bands[0], *(_rotate_band(band, axes) for band in bands[1:])], dim=1),
     )
 
 
-def _bands(sh: Float[Tensor, "n k 3"]) -> list[Tensor]:
-    degrees = range(round(sh.shape[1] ** 0.5))
-    return [sh[:, degree**2 : (degree + 1) ** 2] for degree in degrees]
-
-
-def _rotate_band(band: Float[Tensor, "n b 3"], permute, axes: Float[Tensor, "3 3"]) -> Float[Tensor, "n b 3"]:
+def _rotate_band(band: Float[Tensor, "n b 3"], axes: Float[Tensor, "3 3"]) -> Float[Tensor, "n b 3"]:
     size = band.shape[1]
-    if size == 1:
-        return band
     # The basis of band 1 is (-y, z, -x), so the colour increases along the vector (-c2, -c0, c1).
     if size == 3:
-        vector = torch.stack([-band[:, 2], -band[:, 0], band[:, 1]], dim=1)
-        x, y, z = torch.stack([permute(vector[..., channel]) for channel in range(3)], dim=-1).unbind(1)
+        vectors = torch.stack([-band[:, 2], -band[:, 0], band[:, 1]], dim=-1)
+        x, y, z = _permute(vectors.flatten(end_dim=1), axes).view_as(vectors).unbind(-1)
         return torch.stack([-y, z, -x], dim=1)
     matrix = band_matrix((size - 1) // 2, tuple(axes.flatten().tolist())).to(band.device)
     return torch.einsum("ij,njc->nic", matrix, band.double()).to(band.dtype)

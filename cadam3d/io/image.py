@@ -124,19 +124,13 @@ def contact_sheet(
     cells = images.new_ones(rows * columns, height, width, 3)
     cells[:views] = images
     for cell, label in zip(cells, labels, strict=False):
-        _write_label(cell, label)
-    return (
-        cells.reshape(rows, columns, height, width, 3)
-        .transpose(1, 2)
-        .reshape(rows * height, columns * width, 3)
-    )
-
-
-def _write_label(cell: Float[Tensor, "h w 3"], label: str) -> None:
-    """Draw ``label`` into ``cell`` (in place), in dark or light ink depending on the corner."""
-    height, width, _ = cell.shape
-    mask = Image.new("L", (width, height))
-    ImageDraw.Draw(mask).text((LABEL_MARGIN, LABEL_MARGIN), label, fill=255, font=ImageFont.load_default())
-    coverage = torch.from_numpy(np.array(mask)).to(cell) / 255
-    ink = 0.15 if cell[: height // 8 + 1, : width // 4 + 1].mean() > 0.5 else 0.9
-    cell.lerp_(torch.full_like(cell, ink), coverage[..., None])
+        mask = Image.new("L", (width, height))
+        ImageDraw.Draw(mask).text(
+            (LABEL_MARGIN, LABEL_MARGIN), label, fill=255, font=ImageFont.load_default()
+        )
+        coverage = torch.from_numpy(np.array(mask)).to(cell) / 255
+        # The ink is dark or light depending on the corner.
+        ink = 0.15 if cell[: height // 8 + 1, : width // 4 + 1].mean() > 0.5 else 0.9
+        cell.lerp_(torch.full_like(cell, ink), coverage[..., None])
+    grid = cells.reshape(rows, columns, height, width, 3)
+    return grid.transpose(1, 2).reshape(rows * height, columns * width, 3)

@@ -4,7 +4,6 @@ A model is a folder with a ``model_index.json``, which names a class for each of
 a text encoder, a tokenizer) is loaded separately and when it is needed. Unused parts are never downloaded.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -55,12 +54,9 @@ class ModelSource:
         for model in models:
             if model.kind in kinds:
                 return model
-        raise fail(
-            f"{self.key}.path",
-            expected=f"a {' or '.join(kinds)}",
-            got=", ".join(f"{model.where} (a {model.kind})" for model in models),
-            example=others.get(models[0].kind if models else "", f"{self.key}.path=DIR"),
-        )
+        got = ", ".join(f"{model.where} (a {model.kind})" for model in models)
+        example = others.get(models[0].kind if models else "", f"{self.key}.path=DIR")
+        raise fail(f"{self.key}.path", expected=f"a {' or '.join(kinds)}", got=got, example=example)
 
     def _local(self, path: str) -> "Pretrained":
         is_packaged = path.startswith(PACKAGE)
@@ -119,9 +115,9 @@ class Pretrained:
         diffusers.utils.logging.disable_progress_bar()
         try:
             loaded = self._kind(name).from_pretrained(self.where, **options)
+        except torch.OutOfMemoryError:
+            raise
         except (OSError, ValueError, KeyError, RuntimeError, TypeError) as error:
-            if isinstance(error, torch.OutOfMemoryError):
-                raise
             raise self._unusable(f"{name} of {self.where} cannot be loaded ({short(error)})") from error
         if isinstance(loaded, torch.nn.Module):
             loaded.requires_grad_(False).eval()
@@ -141,15 +137,9 @@ class Pretrained:
 
     def skeleton(self, name: str, dtype: torch.dtype) -> Any:
         """Return a network on the meta device, built from its configuration without loading any weights."""
-        kind, config = self._kind(name), self.config(name)
-        usual = torch.get_default_dtype()
-        torch.set_default_dtype(dtype)
-        try:
-            with torch.device("meta"):
-                network = empty(kind, config)
-        finally:
-            torch.set_default_dtype(usual)
-        return network.requires_grad_(False).eval()
+        with torch.device("meta"):
+            network = empty(self._kind(name), self.config(name))
+        return network.to(dtype).requires_grad_(False).eval()
 
     @property
     def name(self) -> str:
@@ -170,9 +160,9 @@ class Pretrained:
         if not Path(self.where).is_dir():
             # In the cache of the hub, the name of a snapshot folder is its commit.
             return f"{self.where}@{self.file.resolve().parent.name}"
-        files = sorted(path for path in Path(self.where).rglob("*") if path.is_file())
-        facts = [(str(f.relative_to(self.where)), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
-        return json.dumps([str(Path(self.where).resolve()), facts])
+        folder = Path(self.where).resolve()
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        return str([(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files])
 
     def _check_vocabulary(self, name: str, size: int) -> None:
         """Raise ``UserError`` if a tokenizer has far fewer pieces of text than its encoder.
@@ -183,15 +173,17 @@ class Pretrained:
         wanted = self._kind(encoder).config_class.from_dict(self.config(encoder)).vocab_size
         # The encoder of T5 has room for a few more pieces than its tokenizer has.
         if size < wanted / 2:
-            problem = f"{name} of {self.where} knows {size} of the {wanted} pieces of text of {encoder}"
-            raise self._unusable(problem)
+            raise self._unusable(f"{name} of {self.where} knows {size} of the {wanted} pieces of text")
 
     def _kind(self, name: str) -> Any:
         library, kind = (str(entry) for entry in (self.index.get(name) or (None, None))[:2])
-        module = _module(library)
-        if module is None or not hasattr(module, kind):
+        # Some parts belong to a single pipeline, such as the renderer of Shap-E.
+        place = library if library in LIBRARIES else f"diffusers.pipelines.{library}"
+        has_place = library.isidentifier() and find_spec(place) is not None
+        found = getattr(import_module(place), kind, None) if has_place else None
+        if found is None:
             raise self._unusable(f"the installed libraries have no {library}.{kind}, its {name}")
-        return getattr(module, kind)
+        return found
 
     def _unusable(self, problem: str) -> UserError:
         """Return the error about a part that cannot be used."""
@@ -210,15 +202,6 @@ def require_extra(key: str) -> None:
     missing = [name for name in EXTRA if find_spec(name) is None]
     if missing:
         raise UserError(f"{key}: needs {', '.join(missing)}. Try: pip install '.[diffusers]'")
-
-
-def _module(library: str) -> Any:
-    """Return the module that an index names: a library or a pipeline of diffusers; ``None`` for others."""
-    if library in LIBRARIES:
-        return import_module(library)
-    # Some parts belong to a single pipeline, such as the renderer of Shap-E.
-    own = f"diffusers.pipelines.{library}"
-    return import_module(own) if library.isidentifier() and find_spec(own) is not None else None
 
 
 def _read_entries(key: str, file: Path) -> dict[str, Any]:

@@ -12,7 +12,6 @@ import imageio_ffmpeg
 import numpy as np
 from jaxtyping import UInt8
 
-from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
 
@@ -58,7 +57,7 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w c"]], *, fps
 
     ``path`` ends with one of the suffixes in ``FORMATS``. Frames have three channels, or four (straight
     alpha) in a format that can be transparent. Colours of MP4 and WebM have half the resolution, so odd sizes
-    are padded there by repeating the last row or column. Raises ``UserError`` if there is no frame, if the
+    are padded there by repeating the last row or column. Raises ``UserError`` if the
     file cannot be written, or if ffmpeg is missing or fails.
     """
     kind = FORMATS[path.suffix]
@@ -66,7 +65,9 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w c"]], *, fps
         writer = None
         try:
             for each in frames:
-                frame = _even(each) if kind.is_halved else each
+                height, width, _ = each.shape
+                odd = ((0, height % 2), (0, width % 2), (0, 0))
+                frame = np.pad(each, odd, mode="edge") if kind.is_halved else each
                 if writer is None:
                     writer = _open(temporary, kind, fps, frame)
                     _send(writer, None)
@@ -74,20 +75,8 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w c"]], *, fps
         finally:
             if writer is not None:
                 writer.close()
-        require(
-            writer is not None,
-            str(path),
-            expected="at least one frame",
-            got=0,
-            example="exporter.turntable.views=60",
-        )
         if not temporary.is_file() or temporary.stat().st_size == 0:
             raise _ffmpeg_error("it wrote nothing")
-
-
-def _even(frame: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h2 w2 c"]:
-    height, width, _ = frame.shape
-    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
 def _open(path: Path, kind: Format, fps: int, frame: UInt8[np.ndarray, "h w c"]):

@@ -29,7 +29,7 @@ def test_the_frame_rate_and_format_are_what_players_expect(tmp_path):
 
 
 def test_no_frames_are_refused(tmp_path):
-    with pytest.raises(UserError, match="at least one frame"):
+    with pytest.raises(UserError, match="it wrote nothing"):
         write_video(tmp_path / "a.mp4", [], fps=10)
     assert list(tmp_path.iterdir()) == []
 
