@@ -172,7 +172,11 @@ def _evaluate(cfg: DictConfig) -> None:
     page = markdown(analysis)
     print(page)
     place = path.parent
-    facts = {"study": key.study, "catch_trials": key.catch_trials, "trials": len(key.trials)}
+    facts = {
+        "study": key.study,
+        "catch_trials": sum(trial.right is not None for trial in key.trials),
+        "trials": len(key.trials),
+    }
     write_json(place / RESULTS, {"kind": "study results", **facts, "left_out": listed, **analysis.to_json()})
     if listed:
         lines = bullets([f"{each['file']}: {each['reason']}" for each in listed])

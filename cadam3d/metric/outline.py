@@ -81,7 +81,9 @@ class Outline(HeldOutSettings, Metric):
             ours = output.alpha.detach().cpu() > INSIDE
             theirs = true.alpha(cameras).detach().cpu() > INSIDE
             shared = ours & theirs
-            overlaps.append(_overlap(shared, ours | theirs))
+            union = (ours | theirs).sum(dim=(2, 3))
+            # Two empty silhouettes are equal.
+            overlaps.append(torch.where(union > 0, shared.sum(dim=(2, 3)) / union.clamp_min(1), 1.0))
             colours = _mean_colour(output.rgb.detach().float().cpu().clamp(0, 1), shared)
             modes = _mean_colour(true.images(cameras, background).detach().float().cpu(), shared)
             differences.append((_lab(colours) - _lab(modes)).norm(dim=-1))
@@ -93,12 +95,6 @@ class Outline(HeldOutSettings, Metric):
         best = max(range(len(iou)), key=lambda mode: (float(iou[mode]), -float(error[mode])))
         is_known = bool(error[best].isfinite())
         return {"iou": float(iou[best]), **({"colour_error": float(error[best])} if is_known else {})}
-
-
-def _overlap(shared: Bool[Tensor, "m v h w"], either: Bool[Tensor, "m v h w"]) -> Float[Tensor, "m v"]:
-    """Return intersection over union; 1 for a view in which both silhouettes are empty."""
-    union = either.sum(dim=(2, 3))
-    return torch.where(union > 0, shared.sum(dim=(2, 3)) / union.clamp_min(1), 1.0)
 
 
 def _mean_colour(

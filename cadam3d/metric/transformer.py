@@ -73,11 +73,10 @@ def downloaded(key: str, name: str, revision: str | None, needed: tuple[str, ...
     # The errors of the hub are errors of the operating system.
     except (OSError, ValueError) as error:
         folder = f"models/{name.split('/')[1]}"
-        files = " ".join(f"--include '{pattern}'" for pattern in needed)
         commit = f" --revision {revision}" if revision else ""
         raise UserError(
             f"{key}: {name} is not available ({short(error)}). Try, with a network connection: "
-            f"hf download {name}{commit} --local-dir {folder} {files}. Then: {key}={folder}"
+            f"hf download {name}{commit} --local-dir {folder}. Then: {key}={folder}"
         ) from error
     return Path(found)
 

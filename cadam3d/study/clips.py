@@ -13,7 +13,7 @@ import torch
 from jaxtyping import UInt8
 from PIL import Image
 
-from cadam3d.core.cameras import Cameras, turntable
+from cadam3d.core.cameras import turntable
 from cadam3d.core.checks import require_color, require_range, require_whole
 from cadam3d.core.rendering import RenderFn
 from cadam3d.io.image import to_uint8
@@ -53,16 +53,6 @@ class ClipSettings:
         require_color("backdrop", self.backdrop)
         require_whole("quality", self.quality, low=1, high=100)
 
-    def cameras(self) -> Cameras:
-        """Return the cameras of all frames, evenly spaced over one turn that begins at the front."""
-        return turntable(
-            self.frames,
-            elevation_deg=self.elevation_deg,
-            distance=self.distance,
-            fov_y_deg=FOV_Y_DEG,
-            size=self.size,
-        )
-
 
 @dataclass(frozen=True)
 class FilmedTurn:
@@ -74,8 +64,15 @@ class FilmedTurn:
 
 
 def film(render: RenderFn, settings: ClipSettings) -> FilmedTurn:
-    """Return one turn of an object."""
-    cameras, color = settings.cameras(), torch.tensor([float(channel) for channel in settings.backdrop])
+    """Return one turn of an object, which begins at the front."""
+    cameras = turntable(
+        settings.frames,
+        elevation_deg=settings.elevation_deg,
+        distance=settings.distance,
+        fov_y_deg=FOV_Y_DEG,
+        size=settings.size,
+    )
+    color = torch.tensor([float(channel) for channel in settings.backdrop])
     backdrop = to_uint8(color[None, None])
     frames, small, visible = [], [], []
     for some in cameras.parts(VIEWS_AT_ONCE):

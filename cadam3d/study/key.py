@@ -33,11 +33,6 @@ class Key:
     clips: tuple[ClipSource, ...]
     trials: tuple[Trial, ...]
 
-    @property
-    def catch_trials(self) -> int:
-        """Return the number of catch trials."""
-        return sum(trial.right is not None for trial in self.trials)
-
 
 def write_key(path: Path, study: str, plan: StudyPlan, *, seed: int) -> None:
     """Write the key of a study. Raises ``UserError`` if the file cannot be written."""

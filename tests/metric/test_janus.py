@@ -158,9 +158,8 @@ def test_gaussians_with_two_faces_are_worse_than_with_one():
     truth = Truth(lambda cameras, background: renderer(object_)(cameras, background).rgb[None])
     found = [
         Janus().measure(Measurand(gaussians=each, render=renderer(each), prompt="", truth=truth)).numbers
-        for each in (object_, turned, two_faces)
+        for each in (turned, two_faces)
     ]
-    assert found[0]["janus"] == pytest.approx(0, abs=1e-6)
-    assert found[1]["janus"] < 0.01
-    assert found[2]["janus"] > 0.35
-    assert [each["janus_fronts"] for each in found] == [1, 1, 2]
+    assert found[0]["janus"] < 0.01
+    assert found[1]["janus"] > 0.35
+    assert [each["janus_fronts"] for each in found] == [1, 2]

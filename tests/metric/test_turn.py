@@ -10,7 +10,7 @@ from splats import make_gaussians
 from cadam3d.core.cameras import vertical_turn
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import Truth
-from cadam3d.metric import turn
+from cadam3d.metric import mesh, turn
 from cadam3d.metric.base import Measurand
 from cadam3d.metric.fidelity import Fidelity
 from cadam3d.metric.mesh import MeshMetric
@@ -75,7 +75,7 @@ def worn() -> Gaussians:
     return replace(asset(), sh=0.7 * asset().sh)
 
 
-@pytest.mark.parametrize(("turns", "turn_deg"), [(24, 40.0), (24, -153.0), (9, 40.0), (4, 180.0)])
+@pytest.mark.parametrize(("turns", "turn_deg"), [(24, -153.0), (9, 40.0), (4, 180.0)])
 def test_a_turned_asset_is_found_at_its_turn(turns, turn_deg):
     truth = true_object(turns=turns)
     assert facing(truth, shown(turned(asset(), turn_deg))).turn_deg == pytest.approx(turn_deg)
@@ -132,8 +132,11 @@ def test_the_start_is_compared_with_the_images_of_the_turned_asset():
     )
 
 
-def test_the_true_surface_turns_too():
+def test_the_true_surface_turns_too(monkeypatch):
     """A ball beside the axis, which is somewhere else after the turn."""
+    monkeypatch.setattr(mesh, "TRUE_NODES", 64)
+    monkeypatch.setattr(mesh, "CELL", 2 / 64)
+    monkeypatch.setattr(mesh, "GUIDES", 5000)
 
     def ball(points):
         return (points - torch.tensor([0.4, 0.0, 0.0]).to(points)).norm(dim=1)[None] - 0.3
@@ -144,10 +147,10 @@ def test_the_true_surface_turns_too():
     assert here == pytest.approx(-0.3, abs=1e-6)
     assert there > 0.2
     settings = {"resolution": 16, "level": 0.3, "smallest_part": 0.0, "triangles": None}
-    mesh = MeshMetric(**settings, threshold=0.1, samples=200, seed=0)
+    metric = MeshMetric(**settings, threshold=0.1, samples=200, seed=0)
     blob = replace(
         worn().index(slice(0, 1)), means=torch.tensor([[0.0, 0.4, 0.0]]), opacity_logits=torch.tensor([4.0])
     )
     blob = replace(blob, log_scales=torch.full((1, 3), -1.9))
-    measured = mesh.measure(seen(blob, true_object(distance=ball, turn_deg=90.0))).numbers
+    measured = metric.measure(seen(blob, true_object(distance=ball, turn_deg=90.0))).numbers
     assert measured["mesh_chamfer"] < 0.1
