@@ -186,7 +186,9 @@ class GaussianOptimizer:
             bound = self.settings.largest_norm(name, step)
             if bound is None:
                 return gradients
-            clipped[name] = _clipped(part, bound)
+            # Scaled to the Euclidean norm ``bound`` over all elements if it is longer.
+            norm = torch.linalg.vector_norm(part)
+            clipped[name] = part * (bound / norm.clamp_min(bound))
         return joined(clipped)
 
     def _moved(self, gaussians: Gaussians) -> list[Tensor]:
@@ -226,9 +228,3 @@ def joined(parts: Mapping[str, Tensor]) -> Gaussians:
         opacity_logits=parts["opacity"],
         sh=torch.cat([parts["sh_dc"], parts["sh_rest"]], dim=1),
     )
-
-
-def _clipped(gradient: Tensor, bound: float) -> Tensor:
-    """Return ``gradient``, scaled to the Euclidean norm ``bound`` over all elements if it is longer."""
-    norm = torch.linalg.vector_norm(gradient)
-    return gradient * (bound / norm.clamp_min(bound))

@@ -118,14 +118,13 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--repeats", type=positive, default=10, help="turns for each row")
     args = parser.parse_args(words)
     try:
-        built, library = load_tracer()
+        _, library = load_tracer()
     except UserError as error:
         sys.exit(f"bench_tracer: {error}")
-    how = f"compiled now in {built.seconds:.1f} s" if built.seconds else "compiled earlier"
     samples = 1 if args.agreement else args.samples
     library.cadam3d_trace_instructions.restype = ctypes.c_char_p
     instructions = library.cadam3d_trace_instructions().decode()
-    print(f"native tracer: {instructions}, {how}; {samples} x {samples} rays per pixel\n")
+    print(f"native tracer: {instructions}; {samples} x {samples} rays per pixel\n")
     (compare_images if args.agreement else compare_times)(args, library)
 
 

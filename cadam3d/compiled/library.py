@@ -7,7 +7,6 @@ user (or to root), and other users must not be able to write them. No lock is ne
 its finished file into place, and any such file that matches its name is usable.
 """
 
-import ctypes
 import hashlib
 import os
 import platform
@@ -16,7 +15,6 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -84,14 +82,6 @@ class Compiler:
     version: str  # first line of its --version
 
 
-@dataclass(frozen=True)
-class Build:
-    """A compiled library, ready to load."""
-
-    path: Path
-    seconds: float  # time spent compiling; 0 for a library from the cache
-
-
 def find_compiler() -> Compiler | None:
     """Return the first that works of ``$CXX``, ``c++``, ``g++``, ``clang++`` and Python's ``ziglang``."""
     commands = [tuple(os.environ.get("CXX", "").split()), ("c++",), ("g++",), ("clang++",)]
@@ -116,7 +106,7 @@ def find_cached(library: NativeLibrary, cache_dir: Path, compiler: Compiler | No
 
 def build(
     library: NativeLibrary, cache_dir: Path, machine_flags: Sequence[Sequence[str]] = MACHINE_FLAGS
-) -> Build:
+) -> Path:
     """Return the library in ``cache_dir``, and compile it if it is missing.
 
     ``machine_flags`` are alternatives, tried in turn. Raises :class:`UserError` if there is neither a cached
@@ -126,20 +116,19 @@ def build(
     compiler = find_compiler()
     cached = find_cached(library, cache_dir, compiler) if tuple(machine_flags) == MACHINE_FLAGS else None
     if cached:
-        return Build(cached, 0.0)
+        return cached
     if compiler is None:
         raise UserError(
             f"{library.names.key}: expected a C++ compiler ($CXX, c++, g++ or clang++) to build the kernels "
             "once, got none. "
             "Try: pip install '.[compiler]'"
         )
-    start = time.perf_counter()
     with build_folder(cache_dir, library.names) as folder:
         path = _compile(library, compiler, folder / f"{library.name}{SUFFIX}", machine_flags)
         by, digest = short_hash(compiler.version), short_hash(path.read_bytes())
         final = cache_dir / f"{library.name}-{_key(library)}-{by}-{digest}{SUFFIX}"
         keep(path, final)
-    return Build(final, time.perf_counter() - start)
+    return final
 
 
 def own_folder(cache_dir: Path, names: Names) -> Path:
@@ -248,8 +237,3 @@ def _machine() -> str:
     elif sys.platform == "darwin":
         facts.append(_run(["sysctl", "-n", "machdep.cpu.brand_string"]).stdout)
     return "\n".join(facts)
-
-
-def load(build: Build) -> ctypes.CDLL:
-    """Load the library with ctypes."""
-    return ctypes.CDLL(str(build.path))

@@ -76,7 +76,7 @@ def require_choice(key: str, value: object, choices: Sequence[object]) -> None:
     """
     # The types are compared too, because True == 1 == 1.0.
     if not any(type(value) is type(choice) and value == choice for choice in choices):
-        known = [_written(choice) for choice in choices]
+        known = [str(choice).lower() if isinstance(choice, bool) else str(choice) for choice in choices]
         example = f"{key}={nearest(value, known) or known[0]}"
         raise fail(key, expected=f"one of {'|'.join(known)}", got=value, example=example)
 
@@ -89,11 +89,6 @@ def nearest(word: object, known: Iterable[str], *, least: float = 0.6) -> str:
     by_lower = {name.lower(): name for name in known}
     near = difflib.get_close_matches(str(word).lower(), list(by_lower), n=1, cutoff=least)
     return by_lower[near[0]] if near else ""
-
-
-def _written(choice: object) -> str:
-    """Return a choice as it is typed."""
-    return str(choice).lower() if isinstance(choice, bool) else str(choice)
 
 
 def require_color(key: str, value: object, *, otherwise: str = "") -> None:

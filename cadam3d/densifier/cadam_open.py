@@ -87,7 +87,9 @@ class CAdamOpen(CAdam):
         """Return the moments after one more step of the chosen evidence, without waiting for the device."""
         gradients = signal.means
         if self.grad_norm == "per_step_rms":
-            gradients = _over_population_rms(gradients)
+            # The root mean square of the norms over the population is a scale that all gradients share.
+            rms = gradients.square().sum(dim=-1).mean().sqrt()
+            gradients = gradients / torch.where(rms > 0, rms, 1.0)
         after = self.update(state, gradients)
         if self.invisible == "zero":
             return after
@@ -108,9 +110,3 @@ class CAdamOpen(CAdam):
         if self.alpha is not None:
             least_snr = snr_threshold(self.alpha, float(self.beta1), float(self.beta2), state.age)
         return least_drift, least_snr
-
-
-def _over_population_rms(gradients: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Return gradients over the root mean square of their norms, which removes a shared scale."""
-    rms = gradients.square().sum(dim=-1).mean().sqrt()
-    return gradients / torch.where(rms > 0, rms, 1.0)

@@ -174,7 +174,8 @@ class Refine:
         Every comparison is true for healthy rows only, so a row with NaN is pruned too.
         """
         keeps = gaussians.means.isfinite().all(dim=-1)
-        if not self._spares_faint_at(step):
+        since_last_reset = range(max(step - self.prune_grace, 1), step)
+        if not any(self.resets_at(earlier) for earlier in since_last_reset):
             keeps &= gaussians.opacities >= self.min_opacity
         if self.max_scale is not None and step > self.prune_from:
             keeps &= gaussians.scales.amax(dim=-1) <= self.max_scale
@@ -203,10 +204,6 @@ class Refine:
             opacity_logits=each.opacity_logits,
             sh=each.sh,
         )
-
-    def _spares_faint_at(self, step: int) -> bool:
-        """Return whether the last reset was at most ``prune_grace`` steps ago."""
-        return any(self.resets_at(earlier) for earlier in range(max(step - self.prune_grace, 1), step))
 
 
 def _multiples(interval: int, first: int, last: int) -> range:

@@ -15,8 +15,8 @@ from weakref import WeakKeyDictionary
 
 import torch
 from gsplat.strategy import DefaultStrategy
-from gsplat.strategy.ops import duplicate, remove, split
-from jaxtyping import Bool, Float
+from gsplat.strategy.ops import duplicate, split
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 from torch.optim import Optimizer
@@ -182,7 +182,8 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
         before = len(params["means"])
         # CAdam draws nothing from the generator.
         selected = self.cadam().select(_moments(state), step, torch.Generator())
-        is_large = self._longest(params) > self.grow_scale3d * state["scene_scale"]
+        longest = params["scales"].exp().amax(dim=-1)
+        is_large = longest > self.grow_scale3d * state["scene_scale"]
         is_cloned, is_split = selected & ~is_large, selected & is_large
         uses_radii = step < self.refine_scale2d_stop_iter
         if uses_radii:
@@ -201,10 +202,7 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
                 revised_opacity=self.revised_opacity,
             )
             _start_newborns(state, 2 * splits)
-        is_pruned = self._pruned(params, state, step, uses_radii)
-        pruned = int(is_pruned.sum())
-        if pruned:
-            remove(params=params, optimizers=optimizers, state=state, mask=is_pruned)
+        pruned = self._prune_gs(params, optimizers, state, step)
         if uses_radii:
             state["radii"].zero_()
         # The replaced tensors are as large as the new ones.
@@ -214,21 +212,6 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
                 f"Step {step}: cloned {cloned} and split {splits} of {before} Gaussians, pruned {pruned}. "
                 f"Now there are {len(params['means'])}."
             )
-
-    def _pruned(
-        self, params: Params, state: dict[str, Any], step: int, uses_radii: bool
-    ) -> Bool[Tensor, "n"]:
-        """Return the mask of faint Gaussians and, after the first reset, of large ones."""
-        is_pruned = params["opacities"].flatten().sigmoid() < self.prune_opa
-        if step > self.reset_every:
-            is_pruned |= self._longest(params) > self.prune_scale3d * state["scene_scale"]
-            if uses_radii:
-                is_pruned |= state["radii"] > self.prune_scale2d
-        return is_pruned
-
-    def _longest(self, params: Params) -> Float[Tensor, "n"]:
-        """Return the longest standard deviation of each Gaussian, in world units."""
-        return params["scales"].detach().exp().amax(dim=-1)
 
     @torch.no_grad()
     def _measure(self, state: dict[str, Any], info: dict[str, Any], count: int, packed: bool) -> None:

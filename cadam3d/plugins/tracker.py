@@ -98,7 +98,7 @@ class CAdamTracker(CAdamSettings):
             in_range,
             "follow",
             expected=f"row numbers from -1 to {len(self) - 1}",
-            got=rows.tolist() if len(rows) < 10 else f"numbers from {int(rows.min())} to {int(rows.max())}",
+            got=rows.tolist(),
             example="tracker.follow(torch.tensor([0, 1, -1]))",
         )
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.compiled.library import SIMD, Names, NativeLibrary, build, load
+from cadam3d.compiled.library import SIMD, Names, NativeLibrary, build
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
@@ -63,7 +63,7 @@ def cpu_library() -> NativeLibrary:
 @cache
 def load_kernels(cache_dir: str | None) -> ctypes.CDLL:
     """Return the compiled kernels, and compile them if ``cache_dir`` lacks them. Runs once per process."""
-    return load(build(cpu_library(), kernels_dir(cache_dir)))
+    return ctypes.CDLL(str(build(cpu_library(), kernels_dir(cache_dir))))
 
 
 def instruction_set(kernels: ctypes.CDLL) -> str:

@@ -42,7 +42,7 @@ from cadam3d.core.rendering import RenderOutput
 from cadam3d.io.cache import kernels_dir
 from cadam3d.rasterizer import workspace
 from cadam3d.rasterizer.base import Backend, Rasterizer
-from cadam3d.rasterizer.cuda_sort import BLOCK, scan, scan_bytes, sort, sort_bytes, sort_order
+from cadam3d.rasterizer.cuda_sort import BLOCK, pieces, scan, scan_bytes, sort, sort_bytes, sort_order
 from cadam3d.rasterizer.driver import Driver, Launch, Launcher
 from cadam3d.rasterizer.forecast import Forecast, find_forecast
 from cadam3d.rasterizer.native import RenderPass, require_shapes, run_pass
@@ -501,12 +501,12 @@ def _temporary(scratch: dict[str, int]) -> list[int]:
 
 def tile_height(height: int, width: int) -> int:
     """Return the height of the tiles in pixels: 8, or 4 if those would be few."""
-    return 4 if _pieces(height, 8) * _pieces(width, TILE_WIDTH) <= FEW_TILES else 8
+    return 4 if pieces(height, 8) * pieces(width, TILE_WIDTH) <= FEW_TILES else 8
 
 
 def count_tiles(height: int, width: int) -> int:
     """Return the number of tiles of one view."""
-    return _pieces(height, tile_height(height, width)) * _pieces(width, TILE_WIDTH)
+    return pieces(height, tile_height(height, width)) * pieces(width, TILE_WIDTH)
 
 
 def most_slots(absgrad: bool) -> int:
@@ -555,8 +555,4 @@ def _at(tensor: Tensor | None, offset: int) -> int:
 def _launch_each(launch: Launch, kernel: str, count: int, threads: int, *arguments: int) -> None:
     """Launch at least ``count`` threads, or nothing if ``count`` is 0."""
     if count > 0:
-        launch(kernel, _pieces(count, threads), threads, *arguments)
-
-
-def _pieces(count: int, size: int) -> int:
-    return -(-count // size)
+        launch(kernel, pieces(count, threads), threads, *arguments)

@@ -50,7 +50,7 @@ def scan(
 
 def digit_bits(bits: int) -> list[int]:
     """Return the number of bits of each digit: as few digits as possible, and about equally many bits."""
-    digits = _pieces(bits, DIGIT_BITS)
+    digits = pieces(bits, DIGIT_BITS)
     return [(bits + number) // digits for number in reversed(range(digits))]
 
 
@@ -59,8 +59,8 @@ def sort_bytes(capacity: int, bits: int) -> tuple[int, ...]:
     if capacity == 0:
         return 0, 0, 0
     digits = digit_bits(bits)
-    wanted = max(WANTED_BLOCKS, _pieces(capacity, SORT_ITEMS * BLOCK))
-    rows = min(_pieces(capacity, FEWEST_ITEMS * BLOCK), wanted, MOST_BLOCKS)
+    wanted = max(WANTED_BLOCKS, pieces(capacity, SORT_ITEMS * BLOCK))
+    rows = min(pieces(capacity, FEWEST_ITEMS * BLOCK), wanted, MOST_BLOCKS)
     # One more row receives the totals.
     counts = 0 if capacity <= FEW_NUMBERS else 4 * (rows + 1) << max(digits)
     return 4 * capacity, 4 * capacity if len(digits) > 1 else 0, counts
@@ -103,8 +103,8 @@ def _sort(
     if capacity == 0:
         return keys
     assert capacity < 2**31, "the kernels index with 32 bits"
-    items = min(max(_pieces(capacity, BLOCK * WANTED_BLOCKS), FEWEST_ITEMS), SORT_ITEMS)
-    blocks = min(_pieces(capacity, BLOCK * items), MOST_BLOCKS)
+    items = min(max(pieces(capacity, BLOCK * WANTED_BLOCKS), FEWEST_ITEMS), SORT_ITEMS)
+    blocks = min(pieces(capacity, BLOCK * items), MOST_BLOCKS)
     rows = counts if capacity > FEW_NUMBERS else 0
     shift, old = 0, 0
     for number, width in enumerate(digits):
@@ -113,7 +113,7 @@ def _sort(
         if rows:
             launch("sort_count", blocks, BLOCK, keys, *counted, items, shift, width, rows)
         if totals:
-            columns = _pieces(1 << width, WARP)
+            columns = pieces(1 << width, WARP)
             launch("sort_columns", columns, COLUMN_BLOCK, *counted, items, width, blocks, rows, totals)
         # The last pass writes to ``order``.
         new = order if rest % 2 else other_order
@@ -125,8 +125,9 @@ def _sort(
 
 
 def _scan_blocks(count: int) -> int:
-    return min(max(_pieces(count, SCAN_CHUNK), 1), MOST_BLOCKS)
+    return min(max(pieces(count, SCAN_CHUNK), 1), MOST_BLOCKS)
 
 
-def _pieces(count: int, size: int) -> int:
+def pieces(count: int, size: int) -> int:
+    """Return how many pieces of at most ``size`` make ``count``."""
     return -(-count // size)

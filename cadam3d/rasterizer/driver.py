@@ -9,6 +9,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -58,7 +59,7 @@ class Driver(Launcher):
     def _launching(self, index: int) -> AbstractContextManager[Launch]:
         if index not in self._modules:
             cubin = build(self._cache_dir, torch.cuda.get_device_capability(index))
-            self._modules[index] = Module(load_driver(), index, cubin.path.read_bytes())
+            self._modules[index] = Module(load_driver(), index, cubin.read_bytes())
         return self._modules[index].launching(torch.cuda.current_stream(index).cuda_stream)
 
 
@@ -74,7 +75,7 @@ class Module:
     """Compiled kernels in the memory of one device."""
 
     def __init__(self, driver: ctypes.CDLL, index: int, cubin: bytes) -> None:
-        self.driver, self.functions = driver, _Functions(self._find)
+        self.driver, self.find = driver, cache(self._find)
         self._context, self._handle, ordinal = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_int()
         self._popped = ctypes.pointer(ctypes.c_void_p())
         # Launch functions that are not in use at the moment.
@@ -101,6 +102,7 @@ class Module:
         return launch
 
     def _find(self, kernel: str) -> ctypes.c_void_p:
+        """Request the handle of a kernel from the driver."""
         function = ctypes.c_void_p()
         self._call("cuModuleGetFunction", ctypes.byref(function), self._handle, kernel.encode())
         return function
@@ -128,18 +130,6 @@ class Module:
         self.check(name, getattr(self.driver, name)(*arguments))
 
 
-class _Functions(dict[str, ctypes.c_void_p]):
-    """The handles of kernels by name. Each is requested from the driver at its first use."""
-
-    def __init__(self, find: Callable[[str], ctypes.c_void_p]) -> None:
-        super().__init__()
-        self._find = find
-
-    def __missing__(self, kernel: str) -> ctypes.c_void_p:
-        self[kernel] = self._find(kernel)
-        return self[kernel]
-
-
 class _Launch:
     """Launches kernels on ``stream``, as a context in which the device is current for the driver.
 
@@ -151,7 +141,7 @@ class _Launch:
 
     def __init__(self, module: Module) -> None:
         self.stream = ctypes.c_void_p()
-        self._module, self._functions, self._call = module, module.functions, module.driver.cuLaunchKernel
+        self._module, self._find, self._call = module, module.find, module.driver.cuLaunchKernel
         self._buffer, self._size = ctypes.create_string_buffer(8 * MOST_ARGUMENTS), ctypes.c_size_t()
         buffer, size = ctypes.addressof(self._buffer), ctypes.addressof(self._size)
         self._extra = (ctypes.c_void_p * 5)(BUFFER_POINTER, buffer, BUFFER_SIZE, size, END)
@@ -168,7 +158,7 @@ class _Launch:
         count = len(arguments)
         PACKERS[count](self._buffer, 0, *arguments)
         self._size.value = 8 * count
-        function, stream, extra = self._functions[kernel], self.stream, self._extra
+        function, stream, extra = self._find(kernel), self.stream, self._extra
         status = self._call(function, blocks, 1, 1, threads, 1, 1, 0, stream, None, extra)
         if status != 0:
             self._module.check("cuLaunchKernel", status)

@@ -10,7 +10,6 @@ usable.
 
 import ctypes
 import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -53,14 +52,6 @@ class Nvrtc:
     architectures: tuple[int, ...]  # ascending; 75 is sm_75
 
 
-@dataclass(frozen=True)
-class Cubin:
-    """Compiled kernels, ready for the driver."""
-
-    path: Path
-    seconds: float  # time spent compiling; 0 for a file from the cache
-
-
 @cache
 def find_compiler() -> Nvrtc | None:
     """Return the first NVRTC that loads: first from the wheels, then from the system.
@@ -68,7 +59,10 @@ def find_compiler() -> Nvrtc | None:
     In each of the two groups, the ones of torch's CUDA version come first.
     """
     system = sorted(SYSTEM, key=lambda name: not _fits_torch(name))
-    for path in (*sorted(_bundled(), key=_distance_from_torch), *system):
+    bundled = sorted(
+        _bundled(), key=lambda path: (".alt." in path.name, not _fits_torch(path.name), path.name)
+    )
+    for path in (*bundled, *system):
         try:
             return _load(str(path))
         except OSError:
@@ -84,10 +78,6 @@ def _bundled() -> Iterator[Path]:
         for folder in ("lib", "bin", "bin/x86_64"):
             yield from root.glob(f"*/{folder}/{PATTERN}")
     yield from (Path(torch.__file__).parent / "lib").glob(PATTERN)
-
-
-def _distance_from_torch(path: Path) -> tuple[bool, bool, str]:
-    return ".alt." in path.name, not _fits_torch(path.name), path.name
 
 
 def _fits_torch(name: str) -> bool:
@@ -132,7 +122,7 @@ def choose_architecture(capability: tuple[int, int], compiler: Nvrtc) -> int:
     return max(fitting)
 
 
-def build(cache_dir: Path, capability: tuple[int, int]) -> Cubin:
+def build(cache_dir: Path, capability: tuple[int, int]) -> Path:
     """Return the kernels for a compute capability, and compile them if ``cache_dir`` lacks them.
 
     Raises :class:`UserError` if there is no NVRTC, if it fails, if the folder cannot be written, or if
@@ -148,15 +138,14 @@ def build(cache_dir: Path, capability: tuple[int, int]) -> Cubin:
     name = f"rasterizer-{_key(compiler)}-sm{architecture}"
     cache_dir = own_folder(cache_dir, NAMES)
     if cached := find_intact(cache_dir, f"{name}-*.cubin"):
-        return Cubin(cached, 0.0)
-    start = time.perf_counter()
+        return cached
     code = compile_kernels(compiler, architecture)
     final = cache_dir / f"{name}-{short_hash(code)}.cubin"
     with build_folder(cache_dir, NAMES) as folder:
         path = folder / "rasterizer.cubin"
         path.write_bytes(code)
         keep(path, final)
-    return Cubin(final, time.perf_counter() - start)
+    return final
 
 
 def compile_kernels(compiler: Nvrtc, architecture: int, show: Callable[[str], object] | None = None) -> bytes:

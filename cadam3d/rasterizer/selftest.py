@@ -162,13 +162,10 @@ def _render(
     gradients["means2d"] = output.means2d.grad
     if absgrad:
         gradients["absgrad"] = None if output.absgrad is None else output.absgrad.grad
-    return _on_cpu(_seen(output)), _on_cpu(gradients)
-
-
-def _seen(output: RenderOutput) -> dict[str, Tensor]:
-    """Return the images, centres and radii. A centre that is not seen is arbitrary, so it becomes 0."""
-    centres = torch.where(output.visible[..., None], output.means2d, 0.0)
-    return {name: getattr(output, name) for name in (*IMAGES, "radii")} | {"means2d": centres}
+    shown = {name: getattr(output, name) for name in (*IMAGES, "radii")}
+    # A centre that is not seen is arbitrary.
+    shown["means2d"] = torch.where(output.visible[..., None], output.means2d, 0.0)
+    return _on_cpu(shown), _on_cpu(gradients)
 
 
 def _on_cpu(tensors: Mapping[str, Tensor | None]) -> dict[str, Tensor]:

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from cadam3d.core.cameras import turntable
+from cadam3d.core.errors import UserError
 from cadam3d.core.schedule import Linear
 from cadam3d.guidance.distill import Case
 from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
@@ -281,3 +282,8 @@ def test_numbers_that_are_not_finite_become_zero_and_are_counted(make, run, prio
     assert before.log["guidance_nonfinite"] == 0
     assert after.log["guidance_nonfinite"] == 4  # two latents, two pixels
     assert all(torch.as_tensor(value).isfinite() for value in after.log.values())
+
+
+def test_all_weights_zero_are_refused(make):
+    with pytest.raises(UserError, match=r"guidance\.w_gc: expected a number > 0"):
+        make("gcs", **weights_of(0.0, 0.0, 0.0))

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from cadam3d.compiled import library as build_module
-from cadam3d.compiled.library import FLAGS, SIMD, build, find_compiler, load
+from cadam3d.compiled.library import FLAGS, SIMD, build, find_compiler
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
 from cadam3d.core.errors import UserError
 from cadam3d.prior.shapes import ShapesPrior, native_tracer, solids
@@ -291,7 +291,7 @@ def mutants(tmp_path_factory) -> ctypes.CDLL:
     source.write_text(switch + text, encoding="utf-8")
     changed = replace(tracer_library(), sources=(source, SIMD), flags=(*FLAGS, "-O1"))
     # Without flags for this machine, vectors are narrower than those of the other tests.
-    return load(build(changed, folder / "cache", machine_flags=((),)))
+    return ctypes.CDLL(str(build(changed, folder / "cache", machine_flags=((),))))
 
 
 @pytest.fixture(scope="module")

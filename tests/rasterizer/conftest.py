@@ -10,7 +10,7 @@ from mutants import MUTANTS, plant
 from splats import Backend
 
 from cadam3d.compiled import library as build_module
-from cadam3d.compiled.library import Build, build, find_compiler
+from cadam3d.compiled.library import build, find_compiler
 from cadam3d.rasterizer import cuda
 from cadam3d.rasterizer.cpu import CpuRasterizer, cpu_library
 from cadam3d.rasterizer.cuda import CudaRasterizer
@@ -37,17 +37,17 @@ def build_cache(request, tmp_path_factory) -> Path:
     return cache.mkdir("rasterizer") if cache else tmp_path_factory.mktemp("rasterizer")
 
 
-def build_once(folder: Path, *machine_flags: tuple[str, ...]) -> Build:
+def build_once(folder: Path, *machine_flags: tuple[str, ...]) -> Path:
     """Return the CPU kernels in ``folder``, and compile them if they are missing, one process at a time."""
     with FileLock(folder.with_suffix(".lock")):
         built = sorted(folder.glob(f"*{build_module.SUFFIX}"))
         if machine_flags and built:
-            return Build(built[0], 0.0)
+            return built[0]
         return build(cpu_library(), folder, machine_flags or build_module.MACHINE_FLAGS)
 
 
 @pytest.fixture(scope="session")
-def kernel_build(build_cache) -> Build:
+def kernel_build(build_cache) -> Path:
     """Return the CPU kernels as users get them."""
     if find_compiler() is None:
         pytest.skip("no C++ compiler")
@@ -60,8 +60,8 @@ def build_with_flags(build_cache, kernel_build):
     """Return a function that compiles the CPU kernels with other flags for the machine."""
     source = Path(build_module.__file__).read_text()
 
-    def build_other(*flags: str) -> Build:
-        key = content_hash(source, kernel_build.path.name, *flags)
+    def build_other(*flags: str) -> Path:
+        key = content_hash(source, kernel_build.name, *flags)
         return build_once(build_cache / f"cpu-{key}", flags)
 
     return build_other
@@ -94,7 +94,7 @@ def mutants(build_cache, tmp_path_factory) -> Emulator:
 @pytest.fixture(scope="session")
 def cpu(kernel_build) -> CpuRasterizer:
     """Return the CPU rasterizer."""
-    return CpuRasterizer(cache_dir=str(kernel_build.path.parent))
+    return CpuRasterizer(cache_dir=str(kernel_build.parent))
 
 
 @pytest.fixture(scope="session", params=NATIVE)

@@ -66,7 +66,7 @@ def small_checks(monkeypatch):
 @pytest.mark.usefixtures("small_checks")
 def test_every_backend_is_checked_timed_and_written_for_every_scene(kernel_build, tmp_path, capsys):
     path = tmp_path / "bench.json"
-    cpu = CpuRasterizer(cache_dir=str(kernel_build.path.parent))
+    cpu = CpuRasterizer(cache_dir=str(kernel_build.parent))
     words = ["--counts", "50", "80", "--sizes", "16", "24", "--degrees", "0", "1", "--repeats", "2"]
     code = run([*words, "--json", str(path)], {"reference": ReferenceRasterizer(), "cpu": cpu})
     shown = capsys.readouterr().out

@@ -1,5 +1,6 @@
 """The native CPU rasterizer: threads and instruction sets. Its other laws are in test_backends.py."""
 
+import ctypes
 import resource
 import sys
 import weakref
@@ -19,7 +20,6 @@ from splats import (
     render_and_differentiate,
 )
 
-from cadam3d.compiled.library import load
 from cadam3d.rasterizer.cpu import instruction_set, rasterize
 
 
@@ -98,9 +98,9 @@ def test_missing_memory_is_an_error_that_leaves_the_kernels_usable(cpu):
 
 def test_narrower_vectors_and_groups_of_one_view_agree(kernel_build, build_with_flags):
     # One compilation for two independent laws: a single view has no groups, and shows the vectors alone.
-    has_wider_vectors = instruction_set(load(kernel_build)) == "avx512"
+    has_wider_vectors = instruction_set(ctypes.CDLL(str(kernel_build))) == "avx512"
     vectors = ("-march=x86-64-v3",) if has_wider_vectors else ()
-    kernels = load(build_with_flags(*vectors, "-DSPLAT_RECORD_BUDGET=1"))
+    kernels = ctypes.CDLL(str(build_with_flags(*vectors, "-DSPLAT_RECORD_BUDGET=1")))
     assert instruction_set(kernels) != "avx512"
     for views in (1, 3):
         for absgrad in (False, True):

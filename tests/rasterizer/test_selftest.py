@@ -64,7 +64,7 @@ def test_float32_agrees_with_float64_far_inside_the_limits():
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C++ compiler")
 def test_the_native_kernels_pass(kernel_build):
-    agreement = self_test(CpuRasterizer(cache_dir=str(kernel_build.path.parent)), CPU)
+    agreement = self_test(CpuRasterizer(cache_dir=str(kernel_build.parent)), CPU)
     assert agreement.holds, agreement
     assert agreement.repeats
 

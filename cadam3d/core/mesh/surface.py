@@ -124,12 +124,8 @@ class SurfaceSettings:
     def _nothing(self, some: Blobs) -> UserError:
         """Return the error for an asset without a surface."""
         most = float(some.opacities.max()) if len(some.rows) else 0.0
-        # Between the nodes of the grid, the density may be up to five times higher than at them.
-        level = min(float(f"{most / 5:.1g}"), self.level / 2)
-        expected = "a level that the density of the asset reaches"
-        return fail(
-            f"{self.node}.level", expected=expected, got=self.level, example=f"{self.node}.level={level:g}"
-        )
+        expected = f"a density that the asset reaches; its most opaque Gaussian has {most:.2g}"
+        return fail(f"{self.node}.level", expected=expected, got=self.level)
 
 
 def _large_regions(
@@ -295,27 +291,24 @@ def parts_of(count: int, faces: Int[np.ndarray, "f corners"]) -> Int[np.ndarray,
 
 def areas(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f"]:
     """Return the area of each triangle."""
-    return np.linalg.norm(_crosses(vertices, faces), axis=1) / 2
+    from trimesh import triangles  # slow to import
+
+    return triangles.area(vertices[faces])
 
 
 def vertex_normals(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "v 3"]:
     """Return the directions of the sums of the triangles' normals around each vertex, weighted by area."""
-    cross = _crosses(vertices, faces)
-    corners, count = faces.reshape(-1), len(vertices)
-    summed = [
-        np.bincount(corners, weights=np.repeat(cross[:, axis], 3), minlength=count) for axis in range(3)
-    ]
-    normals = np.stack(summed, axis=1)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    from trimesh import geometry, triangles  # slow to import
+
+    cross = triangles.cross(vertices[faces])
+    # Trimesh takes what is much shorter than 1 for zero.
+    cross /= np.abs(cross).max(initial=1e-300)
+    normals = geometry.mean_vertex_normals(len(vertices), faces, cross)
     # The triangles around a vertex may cancel each other. Any direction is right there.
-    return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
-
-
-def _crosses(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    return np.cross(b - a, c - a)
+    has_direction = np.linalg.norm(normals, axis=1, keepdims=True) > 0.5
+    return np.where(has_direction, normals, [0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)

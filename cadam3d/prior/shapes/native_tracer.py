@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from cadam3d.compiled.library import SIMD, Build, Names, NativeLibrary, build, load
+from cadam3d.compiled.library import SIMD, Names, NativeLibrary, build
 from cadam3d.core.cameras import Cameras
 from cadam3d.io.cache import kernels_dir
 from cadam3d.prior.shapes import tracer
@@ -35,13 +35,13 @@ def tracer_library(key: str = "prior.tracer") -> NativeLibrary:
     return NativeLibrary("tracer", names, SOURCES, definitions, "cadam3d_trace_self_test")
 
 
-def load_tracer(key: str = "prior.tracer") -> tuple[Build, ctypes.CDLL]:
-    """Return the native tracer, and compile it if the user's cache folder lacks it.
+def load_tracer(key: str = "prior.tracer") -> tuple[Path, ctypes.CDLL]:
+    """Return the native tracer and its file, and compile it if the user's cache folder lacks it.
 
     Raises ``UserError``, which names ``key``, if it cannot be compiled.
     """
     built = build(tracer_library(key), kernels_dir(None))
-    return built, load(built)
+    return built, ctypes.CDLL(str(built))
 
 
 class _Job(ctypes.Structure):

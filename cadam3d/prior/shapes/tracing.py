@@ -44,7 +44,7 @@ def find_tracer(setting: str, key: str = "prior.tracer") -> Tracer:
     if setting != "torch":
         try:
             built, library = load_tracer(key)
-            return Tracer(built.path.stem, partial(trace_natively, library))
+            return Tracer(built.stem, partial(trace_natively, library))
         except UserError:
             if setting == "native":
                 raise
