@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 from cadam3d import report
 from cadam3d.commands.beginning import link
 from cadam3d.core.errors import UserError
+from cadam3d.core.number import preferred
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.run_folder import ASSET, BEST, CHOICE, LATEST, REPORT, setting_word, shown
 from cadam3d.sweep.choice import (
@@ -18,7 +19,6 @@ from cadam3d.sweep.choice import (
     attempt_of,
     choose,
     measuring_line,
-    preferred,
     read_attempts,
     require_measured,
     require_one_method,
@@ -61,7 +61,7 @@ def run(
     if choice is not None:
         _print(choice, ended.folder)
     elif any(attempt.numbers for attempt in attempts):
-        names = preferred(numbers.values()) if select is None else [select]
+        names = [each.name for each in preferred(numbers.values())] if select is None else [select]
         # The last of several needs no truth.
         line = measuring_line(ended.folder, numbers[names[-1]])
         raise UserError(f"select: no attempt has {' or '.join(names)}. Measure them first. Try: {line}")

@@ -1,5 +1,6 @@
 """Number: how a number that describes an asset is printed, and whether more or less of it is better."""
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -52,6 +53,15 @@ class Number:
         """Return what differs from the defaults, without the name, as plain data for a file."""
         defaults = {field.name: field.default for field in fields(self)}
         return {key: value for key, value in asdict(self).items() if key != "name" and value != defaults[key]}
+
+
+def preferred(numbers: Iterable[Number]) -> list[Number]:
+    """Return the numbers that may decide which asset is the best, the most preferred first, each once.
+
+    A number comes after the one that replaces it.
+    """
+    found = {each.name: each for each in numbers if each.preference is not None}
+    return sorted(found.values(), key=lambda each: (each.preference, not each.replaces, each.name))
 
 
 # The number that every summary has, whichever metrics were chosen.

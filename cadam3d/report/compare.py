@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import binomtest, bootstrap, ttest_1samp
 
-from cadam3d.core.number import Number
+from cadam3d.core.number import Number, preferred
 from cadam3d.report.results import NOISE, PROMPT, ArmSetting, Cell, JobResult, arms_of, measured
 
 RESAMPLES = 2000
@@ -140,15 +140,11 @@ class PairedComparison:
         """Return the number of cells in which one of the two stopped before its last step."""
         return sum(ours.ended_early or theirs.ended_early for ours, theirs in self.pairs)
 
-    def differences(self, value: Value) -> dict[Cell, float]:
-        """Return our value minus theirs in each cell in which both have it."""
-        found = {ours.cell: (value(ours), value(theirs)) for ours, theirs in self.pairs}
-        return {cell: a - b for cell, (a, b) in found.items() if a is not None and b is not None}
-
     def difference(self, value: Value) -> Estimate | None:
-        """Return the difference of a value over the cells in which both have it; None without such a cell."""
-        found = self.differences(value)
-        return Estimate.of(found) if found else None
+        """Return our value minus theirs over the cells in which both have it; None without such a cell."""
+        found = {ours.cell: (value(ours), value(theirs)) for ours, theirs in self.pairs}
+        known = {cell: a - b for cell, (a, b) in found.items() if a is not None and b is not None}
+        return Estimate.of(known) if known else None
 
 
 def compare(results: Sequence[JobResult], ours: ArmSetting, theirs: ArmSetting) -> PairedComparison | None:
@@ -194,9 +190,7 @@ def arms_without_growth(results: Iterable[JobResult]) -> list[str]:
 
 def qualities(results: Iterable[JobResult]) -> list[Number]:
     """Return the numbers by which assets may be chosen, the most preferred one first."""
-    found = {name: result.declared[name] for result in measured(results) for name in result.numbers}
-    preferred = [each for each in found.values() if each.preference is not None]
-    return sorted(preferred, key=lambda each: (each.preference, each.name))
+    return preferred(result.declared[name] for result in measured(results) for name in result.numbers)
 
 
 def value_of(number: Number) -> Value:
@@ -236,19 +230,14 @@ def gain_over(reference: Sequence[JobResult], value: Value) -> Value:
     return gain
 
 
-@dataclass(frozen=True)
-class Spread:
-    """The median of numbers, one per cell, and the quartiles between which the middle half of them is."""
+# The first quartile, the median and the third quartile: between the quartiles is the middle half.
+Quartiles = tuple[float, float, float]
 
-    median: float
-    low: float
-    high: float
 
-    @classmethod
-    def of(cls, values: Iterable[float]) -> "Spread":
-        """Return the spread of at least one value."""
-        low, median, high = np.quantile(list(values), (0.25, 0.5, 0.75)).tolist()
-        return cls(median, low, high)
+def quartiles(values: Iterable[float]) -> Quartiles:
+    """Return the quartiles of at least one value."""
+    low, median, high = np.quantile(list(values), (0.25, 0.5, 0.75)).tolist()
+    return low, median, high
 
 
 @dataclass(frozen=True)
@@ -258,8 +247,8 @@ class FrontierPoint:
     setting: ArmSetting
     is_standard: bool
     early: int  # cells whose job stopped before its last step
-    count: Spread
-    gain: Spread  # of the quality
+    count: Quartiles  # of the Gaussians
+    gain: Quartiles  # of the quality
 
 
 def frontier(results: Sequence[JobResult], arm: str, gain: Value) -> list[FrontierPoint]:
@@ -278,11 +267,11 @@ def frontier(results: Sequence[JobResult], arm: str, gain: Value) -> list[Fronti
                     setting=setting,
                     is_standard=any(each.is_standard for each, _ in known),
                     early=sum(each.ended_early for each, _ in known),
-                    count=Spread.of(each.count for each, _ in known),
-                    gain=Spread.of(found for _, found in known),
+                    count=quartiles(each.count for each, _ in known),
+                    gain=quartiles(found for _, found in known),
                 )
             )
-    return sorted(points, key=lambda point: point.count.median)
+    return sorted(points, key=lambda point: point.count[1])
 
 
 def hull_of(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -303,14 +292,14 @@ def hull_of(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
     return corners
 
 
+def _slope(a: tuple[float, float], b: tuple[float, float]) -> float:
+    return (b[1] - a[1]) / (b[0] - a[0])
+
+
 def quality_at(corners: Sequence[tuple[float, float]], count: float) -> float | None:
     """Return the height of a hull at ``count`` Gaussians; ``None`` outside the range of its settings."""
     x, (xs, ys) = math.log10(count), zip(*corners, strict=True)
     return float(np.interp(x, xs, ys)) if xs[0] - 1e-12 <= x <= xs[-1] + 1e-12 else None
-
-
-def _slope(a: tuple[float, float], b: tuple[float, float]) -> float:
-    return (b[1] - a[1]) / (b[0] - a[0])
 
 
 def above_frontier(

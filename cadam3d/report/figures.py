@@ -93,13 +93,14 @@ def _draw_frontier(axes: Axes, points: Sequence[FrontierPoint], look: Look) -> N
     With one threshold the curve is a line through all settings, which are labelled with it; with more it is
     the hull of their medians.
     """
-    places = [(point.count.median, point.gain.median) for point in points]
+    places = [(point.count[1], point.gain[1]) for point in points]
     is_line = len(points[0].setting.thresholds) == 1
     curve = places if is_line else [(10**x, y) for x, y in hull_of(places)]
     axes.plot(*zip(*curve, strict=True), color=look.color, lw=1.6, zorder=3)
     for point, (x, y) in zip(points, places, strict=True):
-        ends = [[x - point.count.low], [point.count.high - x]], [[y - point.gain.low], [point.gain.high - y]]
-        axes.errorbar(x, y, ends[1], ends[0], color=look.color, alpha=0.35, lw=0.9, zorder=2)
+        bar = {"color": look.color, "alpha": 0.35, "lw": 0.9, "zorder": 2}
+        axes.plot(point.count[::2], (y, y), **bar)
+        axes.plot((x, x), point.gain[::2], **bar)
         is_main = point.is_standard or len(points) == 1
         size, edge = (7.5, INK) if is_main else (4.5, look.color)
         axes.plot(x, y, marker=look.marker, ms=size, color=look.color, mec=edge, zorder=5)
@@ -189,8 +190,8 @@ def _draw_heat(axes: Axes, points: Sequence[FrontierPoint], quality: Number) -> 
     across, down = (sorted(set(values)) for values in zip(*places, strict=True))
     table = np.full((len(down), len(across)), np.nan)
     for point, (x, y) in zip(points, places, strict=True):
-        table[down.index(y), across.index(x)] = point.gain.median
-        text = f"{point.count.median:,.0f}\n{point.gain.median:.{quality.digits}f}"
+        table[down.index(y), across.index(x)] = point.gain[1]
+        text = f"{point.count[1]:,.0f}\n{point.gain[1]:.{quality.digits}f}"
         axes.text(
             across.index(x),
             down.index(y),

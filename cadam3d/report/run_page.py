@@ -6,6 +6,7 @@ from typing import Any
 
 from cadam3d.core.chart import Chart
 from cadam3d.core.errors import UserError
+from cadam3d.core.number import preferred
 from cadam3d.io.declarations import write_declarations
 from cadam3d.io.html import data_url, encoded, source
 from cadam3d.io.ply import read_ply
@@ -91,9 +92,7 @@ def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     if (count := found.get("num_gaussians")) is not None:
         initial = found.get("num_gaussians_initial")
         tiles.append(("Gaussians", f"{count:,.0f}", "" if initial is None else f"from {initial:,.0f}"))
-    known = [each for each in declared(summary).values() if each.name in found]
-    preferred = [each for each in known if each.preference is not None]
-    for each in sorted(preferred, key=lambda each: (each.preference, not each.replaces))[:1]:
+    for each in preferred(each for each in declared(summary).values() if each.name in found)[:1]:
         tiles.append((each.label, each.written(found[each.name]), ""))
     if (size := found.get("asset_bytes")) is not None:
         tiles.append((ASSET, f"{size / MIB:.2f} MiB", ""))

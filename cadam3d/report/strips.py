@@ -53,7 +53,10 @@ def _mask(result: JobResult, step: int) -> ShownPicture:
         return None
     found = [line for line in histograms(result) if line["step"] == step]
     text = f"{sum(found[0]['selected']):,} of {sum(found[0]['counts']):,}" if found else ""
-    return mask_of(read_png(path)), f"step {step}", text
+    # Pictures come in pairs of a view and its mask, all square.
+    picture = read_png(path)
+    size = picture.shape[0]
+    return picture[:, size : 2 * size], f"step {step}", text
 
 
 def assets_figure(results: Sequence[JobResult]) -> Figure | None:
@@ -100,12 +103,6 @@ def first_view(result: JobResult) -> np.ndarray:
     size = dict(flatten(read_config(path))).get("exporter.preview.size") if path.is_file() else None
     size = size if type(size) is int and size > 0 else min(sheet.shape[:2])
     return sheet[:size, :size]
-
-
-def mask_of(picture: np.ndarray) -> np.ndarray:
-    """Return the mask of the first view: pictures come in pairs of a view and its mask, all square."""
-    size = picture.shape[0]
-    return picture[:, size : 2 * size]
 
 
 def _facts(result: JobResult) -> str:

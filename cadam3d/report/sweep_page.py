@@ -22,7 +22,8 @@ from cadam3d.report.results import PROMPT, JobResult, measured, read
 from cadam3d.report.score_maps import declared_scores, score_figure
 from cadam3d.report.style import inline, styled, write_figure
 from cadam3d.settings.line import key_of
-from cadam3d.sweep.folder import Plan, is_sweep, read_plan
+from cadam3d.sweep.folder import Plan, is_sweep, load, read_plan
+from cadam3d.sweep.table import columns_of
 
 
 @dataclass(frozen=True)
@@ -68,32 +69,31 @@ KINDS = {
         "objective where the sweep varies it.",
     ),
 }
-MOST_PROMPTS = 3  # in the title of a page
-LONGEST_PROMPT = 60  # characters of a prompt there
+LONGEST_PROMPTS = 120  # characters, in the title of a page
 SCORE_CAPTION = "Darker cells hold more Gaussians; the dashed lines are values to compare with."
 
 
-def write(sweep_folder: Path, names: Sequence[str] | None = None, baseline: str | None = None) -> Path:
+def write(sweep_folder: Path, baseline: str | None = None) -> Path:
     """Write ``report.html`` and ``figures/`` of the sweep in ``sweep_folder`` from the jobs done so far.
 
-    ``names`` are the figures to draw: those of ``KINDS``, the scores that the jobs declare, and
-    ``frontier_NAME`` of a number. ``None`` stands for the figures that the grid of the sweep names, or else
-    for all that the data allow. ``baseline`` is the arm that others are compared with. Raises ``UserError``
-    if the folder holds no sweep and if a file cannot be written.
+    The grid of the sweep may name its figures: those of ``KINDS``, the scores that the jobs declare, and
+    ``frontier_NAME`` of a number. Otherwise all are drawn that have data. ``baseline`` is the arm that others
+    are compared with. Raises ``UserError`` if the folder holds no sweep and if a file cannot be written.
     """
     if not is_sweep(sweep_folder):
         raise UserError(f"{sweep_folder}: expected a sweep, got another folder. Try: cadam3d sweep --help")
     plan, results = read_plan(sweep_folder), read(sweep_folder)
     if not results:
         raise UserError(f"{sweep_folder}: expected a sweep with jobs, got none. Try: cadam3d sweep --help")
-    names = plan.figures if names is None else names
+    columns = columns_of(load(sweep_folder))
+    jobs = [dict(zip(columns, line, strict=True)) for line in zip(*columns.values(), strict=True)]
     folder = sweep_folder / FIGURES
     comparison = tables.comparison_table(results, baseline)
     medians = tables.medians_table(results)
     tables.write_csv(folder / "comparison.csv", comparison)
     tables.write_csv(folder / "medians.csv", medians)
     kinds = KINDS | _scores(results)
-    chosen = list(kinds) if names is None else names
+    chosen = list(kinds) if plan.figures is None else plan.figures
     kinds |= _frontiers(results)
     drawn = [(kinds[name], _drawn(results, name, kinds[name], folder)) for name in chosen if name in kinds]
     unknown = [name for name in chosen if name not in kinds]
@@ -110,7 +110,7 @@ def write(sweep_folder: Path, names: Sequence[str] | None = None, baseline: str 
         figures=[(kind, svg) for kind, svg in drawn if svg],
         early=[each for each in results if each.outcome != Outcome.FINISHED and not each.is_unfinished],
         waiting=sum(result.is_unfinished for result in results),
-        jobs=table(tables.jobs_table(results), align_decimals=True),
+        jobs=table(jobs, align_decimals=True),
         commands=_commands(plan),
         files=[name for name in (TABLE, *FORMATS, FIGURES) if (sweep_folder / name).exists()],
     )
@@ -158,10 +158,8 @@ def _title(plan: Plan, results: Sequence[JobResult]) -> str:
     """Return the name of the grid, if there is one, and the prompts."""
     grids = [str(word).partition("=")[2].strip("'\"") for word in plan.line if key_of(str(word)) == "grid"]
     name = next(filter(None, grids), "Sweep") if plan.command == "sweep" else plural(len(results), "attempt")
-    prompts = list(filter(None, dict.fromkeys(result.cell[PROMPT] for result in results)))
-    shown = [shorten(text, LONGEST_PROMPT, placeholder=" ...") for text in prompts[:MOST_PROMPTS]]
-    more = f" and {len(prompts) - len(shown)} more" if len(prompts) > len(shown) else ""
-    return f"{name}: {', '.join(shown)}{more}" if shown else name
+    prompts = ", ".join(filter(None, dict.fromkeys(result.cell[PROMPT] for result in results)))
+    return f"{name}: {shorten(prompts, LONGEST_PROMPTS, placeholder=' ...')}" if prompts else name
 
 
 def _commands(plan: Plan) -> str:

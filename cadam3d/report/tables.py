@@ -109,22 +109,6 @@ def medians_table(results: Sequence[JobResult]) -> list[Line]:
     return _without_empty(lines)
 
 
-def jobs_table(results: Sequence[JobResult]) -> list[Line]:
-    """Return every job with its outcome and all its numbers of which more or less is better."""
-    numbers = _compared(results)
-    return [
-        {
-            "job": result.folder.name,
-            "setting": result.setting.name,
-            **{key: value for key, value in result.cell.axes if value},
-            "outcome": result.outcome,
-            **{each.heading: _rounded(result.numbers.get(each.name), each.digits) for each in numbers},
-            "seconds": result.seconds,
-        }
-        for result in results
-    ]
-
-
 def write_csv(path: Path, lines: Sequence[Line]) -> None:
     """Write a table atomically, an estimate as three columns."""
     plain = []

@@ -2,7 +2,7 @@
 
 import shlex
 from argparse import Namespace
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import mean
@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 from cadam3d.core.checks import fail, require_choice, require_whole
 from cadam3d.core.errors import UserError
-from cadam3d.core.number import COUNT, Number
+from cadam3d.core.number import COUNT, Number, preferred
 from cadam3d.core.outcome import Outcome
 from cadam3d.io.records import difference, read_scores
 from cadam3d.io.run_folder import LATEST, RUN_FOLDER, shown
@@ -124,7 +124,8 @@ def choose(attempts: Sequence[Attempt], select: str | None) -> Choice | None:
     with equal numbers, the one with the lowest seed is the best.
     """
     known = {name: number for attempt in attempts for name, number in attempt.declared.items()}
-    for name in preferred(known.values()) if select is None else (select,):
+    names = [each.name for each in preferred(known.values())] if select is None else [select]
+    for name in names:
         replacing = [number.name for number in known.values() if number.replaces == name]
         for key in (*replacing, name):
             values = {each.seed: each.numbers[key] for each in attempts if key in each.numbers}
@@ -134,12 +135,6 @@ def choose(attempts: Sequence[Attempt], select: str | None) -> Choice | None:
                 without = sorted(each.seed for each in attempts if each.seed not in values)
                 return Choice(known[key], {seed: values[seed] for seed in ordered}, without)
     return None
-
-
-def preferred(numbers: Iterable[Number]) -> list[str]:
-    """Return the names of the numbers that decide without ``select=``, the most preferred first."""
-    ranks = {each.name: each.preference for each in numbers if each.preference is not None}
-    return sorted(ranks, key=lambda name: ranks[name])
 
 
 def selectable_numbers(options: Namespace) -> dict[str, Number]:
@@ -169,7 +164,7 @@ def require_measured(
     """
     if select is not None:
         require_choice("select", select, tuple(known))
-    names = preferred(known.values()) if select is None else [select]
+    names = [each.name for each in preferred(known.values())] if select is None else [select]
     metrics = [known[name].metric for name in names]
     if set(metrics) & set(chosen) or select == COUNT.name:
         return

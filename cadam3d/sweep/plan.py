@@ -291,7 +291,9 @@ def compose_all(jobs: Sequence[Job], composer: Composer) -> list[Composed]:
     for job in jobs:
         try:
             composed.append(composer.compose(job.overrides))
-            _refuse_attempts(composed[-1])
+            # A train.yaml from elsewhere may lack this setting.
+            attempts, example = composed[-1].values.get("attempts", 1), "attempts=1 'seed=range(0,3)'"
+            require(attempts == 1, "attempts", expected="1 in a sweep", got=attempts, example=example)
         except Exception as error:
             if (reason := explain(error, "train", job.overrides)) is None:
                 raise
@@ -303,15 +305,6 @@ def compose_all(jobs: Sequence[Job], composer: Composer) -> list[Composed]:
 def require_attempts(attempts: object) -> None:
     """Raise ``UserError`` for a wrong value of the setting ``attempts``."""
     require_whole("attempts", attempts, low=1, high=MOST_ATTEMPTS)
-
-
-def _refuse_attempts(job: Composed) -> None:
-    """Refuse a job that would be several attempts. A train.yaml from elsewhere may lack this setting."""
-    attempts = job.values.get("attempts", 1)
-    require_attempts(attempts)
-    if attempts > 1:
-        example = f"attempts=1 'seed=range(0,{attempts})'"
-        raise fail("attempts", expected="1 in a sweep", got=attempts, example=example)
 
 
 def search_path(overrides: Sequence[str]) -> list[str]:

@@ -139,20 +139,13 @@ def _wait(plan: Plan, row: Row, stop: Path, lock: int) -> int:
                 with suppress(subprocess.TimeoutExpired):
                     return process.wait(POLL_SECONDS)
                 if not is_asked and (signals or stop.exists()):
-                    _ask_to_stop(process)
+                    # On Windows, it ends without saving and later continues from its checkpoint.
+                    process.terminate() if IS_WINDOWS else process.send_signal(signal.SIGINT)
                     is_asked = True
         finally:
             # This has an effect only if an exception has ended the loop.
             process.kill()
             process.wait()
-
-
-def _ask_to_stop(process: subprocess.Popen) -> None:
-    """Make a job save and end. On Windows it ends without saving and later continues from its checkpoint."""
-    if IS_WINDOWS:
-        process.terminate()
-    else:
-        process.send_signal(signal.SIGINT)
 
 
 @contextmanager
@@ -194,17 +187,10 @@ def _record_outcome(folder: Path, code: int) -> None:
         outcome, message = Outcome.INTERRUPTED, "stopped"
     elif code < 0:
         outcome = Outcome.KILLED
-        message = f"by {_signal_name(-code)}" + " (out of memory?)" * (code == -KILL)
+        message = "by SIGKILL (out of memory?)" if code == -KILL else f"by signal {-code}"
     else:
         outcome, message = Outcome.FAILED, _failure_reason(folder / CONSOLE) or f"exit code {code}"
     write_json(folder / SUMMARY, {**summary, "outcome": str(outcome), "message": message})
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
 
 
 def _failure_reason(console: Path) -> str:

@@ -3,13 +3,12 @@
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from statistics import mean
 from typing import Any
 
-from cadam3d.core.errors import UserError
 from cadam3d.core.outcome import Outcome
-from cadam3d.io.jsonl import is_number, read_json
 from cadam3d.io.records import psnr_of, read_summary
 from cadam3d.io.run_folder import ENDED
 from cadam3d.sweep.folder import Row
@@ -21,12 +20,21 @@ POLL_SECONDS = 0.5
 @contextmanager
 def reporting(rows: Sequence[Row]) -> Iterator[None]:
     """Print one line for each job that ends during the block. ``rows`` are all jobs of the sweep."""
-    pending = [row for row in rows if not row.has_result]
+    waiting = [row for row in rows if not row.has_result]
     # Files of an earlier attempt would be reported as new results.
-    for row in pending:
+    for row in waiting:
         (row.folder / ENDED).unlink(missing_ok=True)
-    report = _reporter(rows, pending)
+    count, keys, started = len(waiting), varying_keys(rows), time.monotonic()
     is_over = threading.Event()
+
+    def report() -> None:
+        for row in [row for row in waiting if (row.folder / ENDED).exists()]:
+            waiting.remove(row)
+            left = (time.monotonic() - started) / (count - len(waiting)) * len(waiting)
+            then = f"; about {duration(left)} left" if waiting else ""
+            position = f"{len(rows) - len(waiting):>{len(str(len(rows)))}}/{len(rows)}"
+            result = describe_result(read_summary(row.folder))
+            print(f"[{position}] {describe_job(row, keys)}: {result}{then}", flush=True)
 
     def watch() -> None:
         while not is_over.wait(POLL_SECONDS):
@@ -40,23 +48,6 @@ def reporting(rows: Sequence[Row]) -> Iterator[None]:
         is_over.set()
         thread.join()
         report()
-
-
-def _reporter(rows: Sequence[Row], pending: Sequence[Row]) -> Callable[[], None]:
-    """Return a function that prints the jobs that have ended since its last call."""
-    waiting, keys, started = list(pending), varying_keys(rows), time.monotonic()
-
-    def report() -> None:
-        for row in [row for row in waiting if (row.folder / ENDED).exists()]:
-            waiting.remove(row)
-            ended = len(pending) - len(waiting)
-            left = (time.monotonic() - started) / ended * len(waiting)
-            then = f"; about {duration(left)} left" if waiting else ""
-            position = f"{len(rows) - len(waiting):>{len(str(len(rows)))}}/{len(rows)}"
-            result = describe_result(read_summary(row.folder))
-            print(f"[{position}] {describe_job(row, keys)}: {result}{then}", flush=True)
-
-    return report
 
 
 def describe_job(row: Row, keys: Sequence[str]) -> str:
@@ -82,13 +73,13 @@ def describe_result(summary: Mapping[str, Any]) -> str:
 
 
 def time_left(rows: Sequence[Row]) -> str:
-    """Return how long the jobs without a result will take, from the mean time of the others."""
+    """Return how long the jobs without a result will take, from the mean time of training of the others."""
     left = sum(not row.has_result for row in rows)
-    times = [seconds for row in rows if row.has_result and (seconds := _seconds(row)) is not None]
+    times = [row.summary["seconds"] for row in rows if row.has_result and "seconds" in row.summary]
     if not left or not times:
         return "No job is left." if not left else "How long they take is known once a job has a result."
-    mean = sum(times) / len(times)
-    return f"About {duration(mean * left)} of computing are left, at {duration(mean)} per job."
+    each = mean(times)
+    return f"About {duration(each * left)} of computing are left, at {duration(each)} per job."
 
 
 def duration(seconds: float) -> str:
@@ -97,12 +88,3 @@ def duration(seconds: float) -> str:
         return f"{seconds:.0f} s"
     minutes = seconds / 60
     return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
-
-
-def _seconds(row: Row) -> float | None:
-    """Return how long the process of a job has run; None if that is unknown."""
-    try:
-        seconds = read_json(row.folder / ENDED)["seconds"]
-    except (UserError, KeyError, TypeError):
-        return None
-    return seconds if is_number(seconds) and seconds > 0 else None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cadam3d.core.checks import fail, require, require_whole
+from cadam3d.core.checks import require, require_whole, unless_none
 from cadam3d.io.prompt_files import Prompt, read_prompts, set_names
 
 KEY, FILE = "prompts", "prompts.file"
@@ -45,9 +45,8 @@ class PromptChoice:
         if self.shard is None:
             return prompts
         number, count = self.shard
-        if count > len(prompts):
-            expected = f"no more shards than prompts ({len(prompts)})"
-            raise fail(SHARD, expected=expected, got=f"{number}/{count}", example=f"{SHARD}=1/{len(prompts)}")
+        expected, example = f"at most {len(prompts)} shards", f"{SHARD}=1/{len(prompts)}"
+        require(count <= len(prompts), SHARD, expected=expected, got=f"{number}/{count}", example=example)
         begin, end = ((number + step) * len(prompts) // count for step in (-1, 0))
         return prompts[begin:end]
 
@@ -59,34 +58,24 @@ def read_choice(node: Mapping[Any, Any] | None, default: str | None = None) -> P
     """
     given = {key: value for key, value in (node or {}).items() if value is not None}
     source, category, first = given.get("file", default), given.get("category"), given.get("first")
-    if source is None:
-        if given:
-            raise fail(KEY, expected="a file or a set", got=given, example=f"{KEY}={set_names()[0]}")
+    if not given and source is None:
         return None
     expected = f"a file, or one of the sets {'|'.join(set_names())}"
-    require(_is_text(source), KEY, expected=expected, got=source, example=f"{KEY}={set_names()[0]}")
-    if first is not None:
-        require_whole(FIRST, first, low=1)
-    if category is not None:
-        example = f"{CATEGORY}=Material"
-        require(_is_text(category), CATEGORY, expected="a category", got=category, example=example)
-        category = category.strip()
+    is_text = isinstance(source, str) and bool(source.strip())
+    require(is_text, KEY, expected=expected, got=source, example=f"{KEY}={set_names()[0]}")
+    unless_none(require_whole, FIRST, first, low=1)
+    category = None if category is None else str(category).strip()
     return PromptChoice(source=source, category=category, first=first, shard=_shard(given.get("shard")))
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and bool(value.strip())
 
 
 def _of_category(prompts: tuple[Prompt, ...], category: str | None) -> tuple[Prompt, ...]:
     """Return the prompts of a category, in upper or lower case; None means all prompts."""
     if category is None:
         return prompts
-    chosen = tuple(each for each in prompts if each.category.casefold() == category.casefold())
-    if not chosen:
-        known = dict.fromkeys(each.category for each in prompts if each.category)
-        expected = f"one of {'|'.join(known)}" if known else "a file in which prompts have categories"
-        raise fail(CATEGORY, expected=expected, got=category, example=f"{CATEGORY}=null")
+    chosen = tuple(each for each in prompts if category and each.category.casefold() == category.casefold())
+    known = dict.fromkeys(each.category for each in prompts if each.category)
+    expected = f"one of {'|'.join(known)}"
+    require(bool(chosen), CATEGORY, expected=expected, got=category, example=f"{CATEGORY}=null")
     return chosen
 
 

@@ -9,7 +9,7 @@ import signal
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -32,7 +32,6 @@ from cadam3d.io.run_folder import (
     claim,
     has_file,
     holds_run,
-    not_writable,
     numbered,
     occupant_of_sweep,
     setting_word,
@@ -85,7 +84,8 @@ def run_sweep(
         print(f"{_title(sweep, rows)}\n\n{listing(rows)}\n\n{time_left(rows)}")
         return Ended(folder, 0, was_dry=True)
     claim(folder, sweep.folder_key, is_chosen=True)
-    with _locked(folder, sweep.folder_key), _stoppable(folder) as stop:
+    lock = locked(folder / LOCK, lambda holder: in_use(folder, holder, sweep.folder_key))
+    with lock, _stoppable(folder) as stop:
         _refuse_occupied(folder, sweep.folder_key)
         _write_plan(sweep, overrides, flags)
         on_start(folder)
@@ -227,25 +227,13 @@ def _report_results(sweep: Sweep, rows: Sequence[Row], problem: str) -> int:
         return 0
     counts = Counter(row.outcome for row in left)
     which = ", ".join(f"{number} {outcome}" for outcome, number in counts.items())
-    consoles = [row.folder / CONSOLE for row in left if (row.folder / CONSOLE).is_file()]
-    see = f"; see {shown(consoles[0])}" if consoles else ""
     print(
-        f"cadam3d: {len(left)} of {sweep.count(len(rows))} without a result ({which}){see}. "
+        f"cadam3d: {len(left)} of {sweep.count(len(rows))} without a result ({which}); see {CONSOLE} in "
+        f"their folders, such as {shown(left[0].folder)}. "
         "Type the same line again to continue.",
         file=sys.stderr,
     )
     return 1
-
-
-@contextmanager
-def _locked(folder: Path, key: str) -> Iterator[None]:
-    """Keep other sweeps and runs out of the folder until this process ends, in whatever way."""
-    with ExitStack() as stack:
-        try:
-            stack.enter_context(locked(folder / LOCK, lambda holder: in_use(folder, holder, key)))
-        except OSError as error:
-            raise not_writable(key, folder, error) from error
-        yield
 
 
 @contextmanager

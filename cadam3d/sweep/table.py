@@ -2,14 +2,13 @@
 
 import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from cadam3d.io.atomic import replacing
 from cadam3d.io.jsonl import to_json
-from cadam3d.io.records import Score, declared, difference, psnr_of, read_scores
-from cadam3d.io.run_folder import TABLE, setting_word, shown
+from cadam3d.io.records import declared, difference, psnr_of, read_scores
+from cadam3d.io.run_folder import TABLE
 from cadam3d.sweep.folder import Row, load
 
 FACTS = ("num_gaussians", "num_gaussians_initial", "psnr", "ssim", "seconds", "asset_bytes", "message")
@@ -18,14 +17,6 @@ BRIEF = 80  # characters
 LABELS = ("prompt_name", "category")
 # Columns of the table in the terminal, besides the outcome and the settings in which jobs differ.
 SHOWN = ("num_gaussians", "psnr", "seconds")
-
-
-@dataclass(frozen=True)
-class Scores:
-    """The scores of jobs that may be in one table, because each was measured in one way."""
-
-    columns: Mapping[str, Sequence[float | None]]  # one value per job, by the name of the number
-    left_out: Sequence[str]  # a sentence about each number that was measured in different ways
 
 
 def write_table(sweep: Path) -> list[Row]:
@@ -47,10 +38,10 @@ def as_text(rows: Sequence[Row]) -> str:
 
     Sentences below it say which scores it leaves out.
     """
-    scores = _scores(rows)
-    shown = [row.summary | {"psnr": psnr_of(row.summary), "outcome": row.outcome} for row in rows]
-    columns = {name: [facts.get(name) for facts in shown] for name in ("outcome", *SHOWN)}
-    return "\n".join([_table(rows, {**columns, **scores.columns}), *scores.left_out])
+    scores, left_out = _scores(rows)
+    facts = [row.summary | {"psnr": psnr_of(row.summary), "outcome": row.outcome} for row in rows]
+    columns = {name: [each.get(name) for each in facts] for name in ("outcome", *SHOWN)}
+    return "\n".join([_table(rows, {**columns, **scores}), *left_out])
 
 
 def listing(rows: Sequence[Row]) -> str:
@@ -69,24 +60,20 @@ def _table(rows: Sequence[Row], columns: Mapping[str, Sequence[Any]]) -> str:
     return aligned([list(whole), *zip(*whole.values(), strict=True)])
 
 
-def scores_of(jobs: Sequence[Mapping[str, Score]], sweep: Path) -> Scores:
-    """Return the scores of the jobs of a sweep, by name for each job, as columns. Missing ones are None.
+def _scores(rows: Sequence[Row]) -> tuple[dict[str, list[float | None]], list[str]]:
+    """Return the scores of the jobs as columns, by name, and a sentence about each that is left out.
 
     A number that was measured in different ways (with different protocols, models or lists of prompts) is
     left out.
     """
-    columns: dict[str, list[float | None]] = {}
-    left_out = []
+    jobs = [read_scores(row.folder, row.summary) for row in rows]
+    columns, left_out = {}, []
     for name in dict.fromkeys(name for job in jobs for name in job):
-        found = [job.get(name) for job in jobs]
-        problem = difference(name, [score for score in found if score is not None])
-        if problem is None:
-            columns[name] = [None if score is None else score.value for score in found]
+        if problem := difference(name, [job[name] for job in jobs if name in job]):
+            left_out.append(f"{problem}, so it is not in the table. Try: cadam3d eval --help")
         else:
-            metric = next(score.metric for score in found if score is not None) or name
-            again = f"cadam3d eval {setting_word('run', shown(sweep))} 'metric=[{metric}]'"
-            left_out.append(f"{problem}, so it is not in the table. Try: {again}")
-    return Scores(columns, left_out)
+            columns[name] = [job[name].value if name in job else None for job in jobs]
+    return columns, left_out
 
 
 def aligned(lines: Sequence[Sequence[Any]]) -> str:
@@ -95,11 +82,6 @@ def aligned(lines: Sequence[Sequence[Any]]) -> str:
     widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
     padded = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in texts]
     return "\n".join("  ".join(line).rstrip() for line in padded)
-
-
-def _scores(rows: Sequence[Row]) -> Scores:
-    folder = rows[0].folder.parent if rows else Path()
-    return scores_of([read_scores(row.folder, row.summary) for row in rows], folder)
 
 
 def brief(value: Any) -> str:
@@ -118,20 +100,23 @@ def varying_keys(rows: Sequence[Row]) -> list[str]:
     ]
 
 
-def _write(path: Path, rows: Sequence[Row]) -> None:
-    columns: dict[str, Sequence[Any]] = {
+def columns_of(rows: Sequence[Row]) -> dict[str, Sequence[Any]]:
+    """Return the columns of the table: arm, settings, outcome, numbers and folder of each job."""
+    labels = {name: [getattr(row, name) for row in rows] for name in LABELS}
+    return {
         "job": [row.number for row in rows],
         "arm": [row.arm for row in rows],
-        **{name: [getattr(row, name) for row in rows] for name in LABELS},
+        **{name: values for name, values in labels.items() if any(values)},
         **{key: [_plain(row.swept.get(key)) for row in rows] for key in _swept_keys(rows)},
         "outcome": [row.outcome for row in rows],
         **{name: [row.summary.get(name) for row in rows] for name in (*FACTS, *_comparisons(rows))},
-        **_scores(rows).columns,
+        **_scores(rows)[0],
         "folder": [row.name for row in rows],
     }
-    for name in LABELS:
-        if not any(columns[name]):
-            del columns[name]
+
+
+def _write(path: Path, rows: Sequence[Row]) -> None:
+    columns = columns_of(rows)
     with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)

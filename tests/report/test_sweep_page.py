@@ -81,21 +81,14 @@ def test_nothing_that_a_user_typed_becomes_markup(jobs):
     assert nasty not in report.write_sweep(jobs.folder).read_text(encoding="utf-8")
 
 
-def heading(folder) -> str:
-    """Return the heading of the page of a sweep, which must also be its title."""
-    page = report.write_sweep(folder).read_text(encoding="utf-8")
-    found = re.search(r"<h1>(.*)</h1>", page)
-    assert found is not None
-    assert f"<title>{found.group(1)} - cadam3d</title>" in page
-    return html.unescape(found.group(1))
-
-
 def test_the_title_of_a_list_names_some_prompts(jobs):
-    for prompt in ("a red torus", "a blue cube", "a <b>", "a cone", "a very " + "long " * 30 + "prompt"):
-        for arm in ("baseline", "cadam"):
-            for seed in (0, 1):
-                jobs.add(arm, f"prompt='{prompt}'", f"seed={seed}", n=100, psnr=20.0)
-    assert heading(jobs.folder) == "Sweep: a red torus, a blue cube, a <b> and 2 more"
+    for prompt in ("a red torus", "a <b>", "a very " + "long " * 30 + "prompt"):
+        jobs.add("cadam", f"prompt='{prompt}'", n=100, psnr=20.0)
+    page = html.unescape(report.write_sweep(jobs.folder).read_text(encoding="utf-8"))
+    title = re.findall(r"<h1>(.*)</h1>", page)[0]
+    assert title.startswith("Sweep: a red torus, a <b>, a very long ")
+    assert title.endswith("long ...")
+    assert f"<title>{title} - cadam3d</title>" in page
 
 
 @pytest.mark.parametrize("prompts", [5, 6])
@@ -207,7 +200,6 @@ def test_numbers_of_a_metric_from_elsewhere_are_in_the_tables(jobs):
     [line] = tables.comparison_table(results)
     assert line["shine (lx)"].median == 1.5
     assert [line["shine (lx)"] for line in tables.medians_table(results)] == [2.0, 3.5]
-    assert [line["shine (lx)"] for line in tables.jobs_table(results)] == [2.0, 3.5]
 
 
 def test_the_medians_have_a_line_per_objective_level_and_arm(jobs):

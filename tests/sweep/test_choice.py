@@ -145,6 +145,7 @@ def only_folder() -> Path:
 
 
 LINE = ("prompt=an attempt", "attempts=4")
+TWO = ("prompt=an attempt", "attempts=2")
 
 
 def test_every_attempt_is_kept_and_the_best_is_linked(train):
@@ -221,15 +222,13 @@ def test_a_number_that_no_chosen_metric_measures_is_refused_before_anything_runs
 
 
 def test_a_number_of_a_later_evaluation_counts(train):
-    train(*LINE)
+    train(*TWO)
     folder = only_folder()
-    _, _, err = train(*LINE, "select=clip_score")
-    assert "select: expected metrics that measure clip_score" in err
-    for seed in range(4):
-        number = {"num_gaussians": 5, "clip_score": 30.0 + seed}
+    for seed in range(2):
+        number = {"num_gaussians": 5, "clip_score": 30.0 - seed}
         (folder / f"seed={seed}" / "eval.json").write_text(json.dumps(declared(number)))
-    assert train(*LINE, "select=clip_score")[0] == 0
-    assert (folder / "best").readlink() == Path("seed=3")
+    assert train(*TWO, "select=clip_score")[0] == 0
+    assert (folder / "best").readlink() == Path("seed=0")
 
 
 def test_attempts_without_the_number_are_kept_and_the_message_says_how_to_measure_them(train):
@@ -254,13 +253,8 @@ def test_numbers_that_were_measured_in_different_ways_are_not_compared(train):
     ("words", "message"),
     [
         (["attempts=0"], "attempts: expected a whole number >= 1 and <= 1000, got 0."),
-        (["attempts=two"], "attempts: expected a whole number"),
         (["attempts=2", "select=psnrr"], "Try: select=psnr"),
-        (["attempts=2", "select=turn_deg"], "select: expected one of "),
-        (
-            ["attempts=2", "metric=[]"],
-            "Try: 'metric=[fidelity]'",
-        ),
+        (["attempts=2", "metric=[]"], "Try: 'metric=[fidelity]'"),
         (["attempts=2", "--multirun"], "attempts: expected 1 in a sweep"),
         (["attempts=1", "dry_run=true"], "dry_run: expected a sweep or several attempts"),
     ],
@@ -272,14 +266,6 @@ def test_what_cannot_be_done_is_refused_before_anything_runs(words, message, tra
     assert not Path("multirun").exists()
 
 
-def test_a_dry_run_lists_the_attempts_and_leaves_nothing_behind(train):
-    code, out, _ = train(*LINE, "dry_run=true")
-    assert code == 0
-    assert out.startswith("4 attempts in outputs/an-attempt_")
-    assert out.count("to run") == 4
-    assert not Path("outputs").exists()
-
-
 def test_the_folder_of_a_run_and_one_with_a_file_called_best_are_refused(train):
     Path("mine/best").mkdir(parents=True)
     code, _, err = train(*LINE, "hydra.run.dir=mine")
@@ -287,6 +273,10 @@ def test_the_folder_of_a_run_and_one_with_a_file_called_best_are_refused(train):
     assert err == "cadam3d: hydra.run.dir: mine holds best. Try: hydra.run.dir=mine-2\n"
 
 
-def test_attempts_that_are_trusted_have_the_folder_that_they_had(train):
-    outputs = [train(*LINE, "dry_run=true", *more)[1].split()[3] for more in ([], ["trust=true"])]
-    assert outputs[0] == outputs[1]
+def test_a_dry_run_lists_the_attempts_in_the_same_folder_also_if_they_are_trusted(train):
+    (code, plain, _), (_, trusted, _) = (train(*LINE, "dry_run=true", *more) for more in ([], ["trust=true"]))
+    assert code == 0
+    assert plain.startswith("4 attempts in outputs/an-attempt_")
+    assert plain.count("to run") == 4
+    assert plain.split()[3] == trusted.split()[3]
+    assert not Path("outputs").exists()

@@ -12,7 +12,6 @@ from cadam3d.sweep.folder import Job, Plan, read_plan, write_plan
 
 JOB = Job(arm="cadam", name="cadam_seed=1", overrides=["prompt=a cube"], swept={"seed": 1})
 PLAN = Plan(cwd="/tmp", flags=[], threads=2, jobs=[JOB], figures=None, line=["prompt=a cube"])
-WRONG = [None, True, 7, 0.5, "x\0", [7], [None], {"a": 1}, [["x"]], -1]
 
 
 def test_a_plan_is_read_as_it_was_written(tmp_path: Path):
@@ -22,20 +21,11 @@ def test_a_plan_is_read_as_it_was_written(tmp_path: Path):
 
 @pytest.mark.parametrize("key", [*asdict(PLAN), *(f"jobs.{key}" for key in asdict(JOB))])
 def test_no_entry_of_a_plan_has_another_type(tmp_path: Path, key: str):
-    plausible = {
-        "threads": [None, 7, -1],
-        "figures": [None],
-        "paper_table": [True],
-        "jobs.swept": [{"a": 1}],
-    }.get(key, [])
-    for wrong in WRONG:
+    for wrong in (0.5, "x\0", [7], [["x"]]):
         content = asdict(PLAN)
         name = key.removeprefix("jobs.")
         (content["jobs"][0] if name != key else content)[name] = wrong
         write_json(tmp_path / "jobs.json", content)
-        if any(type(value) is type(wrong) and value == wrong for value in plausible):
-            read_plan(tmp_path)
-            continue
         with pytest.raises(UserError, match="not the plan of a sweep"):
             read_plan(tmp_path)
 

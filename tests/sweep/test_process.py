@@ -87,14 +87,12 @@ def test_a_job_gets_its_folder_the_flags_and_the_threads_of_the_plan(sweep, call
     ]
 
 
-@pytest.mark.parametrize("is_root", [True, False])
-def test_a_checkout_in_the_current_folder_is_found_by_its_jobs(is_root, sweep, calls, tmp_path, monkeypatch):
-    monkeypatch.setattr(process, "PACKAGE_ROOT", tmp_path if is_root else tmp_path / "elsewhere")
+def test_a_checkout_in_the_current_folder_is_found_by_its_jobs(sweep, calls, tmp_path, monkeypatch):
+    monkeypatch.setattr(process, "PACKAGE_ROOT", tmp_path)
     monkeypatch.setenv("PYTHONPATH", "mine")
     folder = sweep("a cube")
     run_job(folder, 0)
-    [call] = calls(folder)
-    assert call["path"] == (f"{tmp_path}{os.pathsep}mine" if is_root else "mine")
+    assert calls(folder)[0]["path"] == f"{tmp_path}{os.pathsep}mine"
 
 
 def test_a_job_with_a_checkpoint_continues_from_it(sweep, calls):

@@ -53,26 +53,17 @@ def test_a_category_and_a_number_choose_a_part(tmp_path):
 @pytest.mark.parametrize(
     ("node", "expected"),
     [
-        (
-            {"shard": "0/3"},
-            "prompts.shard: expected i/n, with i from 1 to n, got '0/3'. Try: prompts.shard=1/4",
-        ),
+        ({"shard": "0/3"}, "prompts.shard: expected i/n"),
         ({"shard": "4/3"}, "prompts.shard: expected i/n"),
         ({"shard": 2}, "prompts.shard: expected i/n"),
-        (
-            {"shard": "1/51"},
-            "prompts.shard: expected no more shards than prompts (50), got '1/51'",
-        ),
+        ({"shard": "1/51"}, "prompts.shard: expected at most 50 shards, got '1/51'"),
         ({"first": 0}, "prompts.first: expected a whole number >= 1, got 0"),
         ({"first": True}, "prompts.first: expected a whole number"),
-        (
-            {"category": "Matter"},
-            "expected one of Material|Structure|Concept, got 'Matter'",
-        ),
-        ({"category": ""}, "prompts.category: expected a category"),
+        ({"category": "Matter"}, "expected one of Material|Structure|Concept, got 'Matter'"),
+        ({"category": ""}, "prompts.category: expected"),
         ({"file": ""}, "prompts: expected a file, or one of the sets"),
         ({"file": 7}, "prompts: expected a file, or one of the sets"),
-        ({"file": None, "shard": "1/2"}, "prompts: expected a file or a set, got {'shard': '1/2'}"),
+        ({"file": None, "shard": "1/2"}, "prompts: expected a file, or one of the sets"),
     ],
 )
 def test_wrong_parts_are_refused(node, expected):
