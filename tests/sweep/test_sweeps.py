@@ -721,8 +721,7 @@ def test_a_dry_run_refuses_results_with_other_settings_like_the_sweep_itself(swe
     line = ("prompt=a cube", "seed=0,1", "steps=6", "hydra.sweep.dir=here")
     result = sweep(*line, "dry_run=true")
     assert result.code == 1
-    assert result.err.endswith("Try: hydra.sweep.dir=here-2
-")
+    assert result.err.endswith("Try: hydra.sweep.dir=here-2\n")
 
 
 def test_a_dry_run_is_on_or_off(sweep):
