@@ -39,8 +39,7 @@ def paper_of(background: Sequence[float] | str) -> Color:
     """Return the colour behind captions: the background's, or white beside transparent pictures."""
     if isinstance(background, str):
         return PAPER
-    red, green, blue = (round(255 * channel) for channel in background)
-    return red, green, blue
+    return tuple(round(255 * channel) for channel in background)
 
 
 def paint(

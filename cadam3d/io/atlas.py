@@ -5,7 +5,7 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.mesh.surface import Surface
@@ -31,6 +31,8 @@ def require_xatlas() -> None:
 
 def paint(surface: Surface, colors: ColorFn, size: int) -> Texture:
     """Return a texture of ``size`` x ``size`` pixels, in which ``colors`` gives the colour of each texel."""
+    from scipy import ndimage  # slow to import
+
     vertices, faces, uv = _unwrapped(surface, size)
     texel, face, weights = nearest_points(uv[faces] * size, size)
     picture = np.zeros((size * size, 3), dtype=np.uint8)
@@ -43,7 +45,11 @@ def paint(surface: Surface, colors: ColorFn, size: int) -> Texture:
         normals = (weights[some, :, None] * surface.normals[corners]).sum(1)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         picture[texel[some]] = np.rint(colors(points, normals) * 255).astype(np.uint8)
-    filled = _filled(picture.reshape(size, size, 3), is_painted.reshape(size, size))
+    # Every other texel gets the colour of the nearest painted one.
+    nearest: Any = ndimage.distance_transform_edt(
+        ~is_painted.reshape(size, size), return_distances=False, return_indices=True
+    )
+    filled = picture.reshape(size, size, 3)[tuple(nearest)]
     # The rows of the picture begin at the upper edge, v at the lower one.
     return Texture(vertices, faces, uv, np.ascontiguousarray(filled[::-1]))
 
@@ -117,12 +123,3 @@ def _nearest(
     weights[is_flat], places[is_flat, :2] = (1, 0, 0), corners[is_flat, 0]
     weights = np.clip(weights, 0, 1)
     return weights / weights.sum(1, keepdims=True), np.linalg.norm(points - places[:, :2], axis=1)
-
-
-def _filled(picture: np.ndarray, is_painted: Bool[np.ndarray, "h w"]) -> np.ndarray:
-    """Return the picture with every other texel in the colour of the nearest painted one."""
-    from scipy import ndimage  # slow to import
-
-    nearest: Any = ndimage.distance_transform_edt(~is_painted, return_distances=False, return_indices=True)
-    row, column = nearest
-    return picture[row, column]

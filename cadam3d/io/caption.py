@@ -7,23 +7,15 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from cadam3d.core import palette
 
-Color = tuple[int, int, int]
-
-
-def _rgb(color: str) -> Color:
-    """Return a colour such as ``#ffffff`` as three numbers from 0 to 255."""
-    red, green, blue = bytes.fromhex(color.removeprefix("#"))
-    return red, green, blue
-
-
+Color = tuple[int, ...]  # red, green and blue from 0 to 255
 # The colours of a title and of a detail, on light and on dark paper.
-LIGHT = (_rgb(palette.INK), _rgb(palette.SOFT))
-DARK = (_rgb(palette.DARK[palette.INK]), _rgb(palette.DARK[palette.SOFT]))
-PAPER = _rgb(palette.PAPER)
+LIGHT = (palette.INK, palette.SOFT)
+DARK = (palette.DARK[palette.INK], palette.DARK[palette.SOFT])
+PAPER = ImageColor.getrgb(palette.PAPER)[:3]
 BOLD, REGULAR = "DejaVuSans-Bold.ttf", "DejaVuSans.ttf"
 # The size of letters as a share of the width of a picture, and its limits.
 SHARE = 1 / 18
@@ -85,7 +77,7 @@ def font(face: str, size: int) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts", "ttf", face), size)
 
 
-def _write(image: Image.Image, text: str, top: int, face: str, size: int, color: Color) -> None:
+def _write(image: Image.Image, text: str, top: int, face: str, size: int, color: str) -> None:
     """Write one line in the middle of ``image`` (in place), ``top`` pixels below its upper border."""
     text, room = plain(text), image.width - size // 2
     while size > SMALLEST and font(face, size).getlength(text) > room:

@@ -75,8 +75,14 @@ def write_gltf(
         whole["accessors"][first] |= {"min": corners.min(0).tolist(), "max": corners.max(0).tolist()}
     if picture:
         whole["images"] = [{"bufferView": len(arrays), "mimeType": "image/png"}]
+    text = json.dumps(whole, separators=(",", ":")).encode("ascii")
+    text += b" " * (-len(text) % 4)
+    chunks = [CHUNK.pack(len(text), b"JSON"), text]
+    if body:
+        chunks += [CHUNK.pack(len(body), b"BIN\0"), body]
+    length = HEADER.size + sum(map(len, chunks))
     with replacing(path) as temporary:
-        temporary.write_bytes(_container(whole, body))
+        temporary.write_bytes(b"".join([HEADER.pack(b"glTF", 2, length), *chunks]))
 
 
 def _accessor(number: int, array: np.ndarray) -> dict[str, Any]:
@@ -84,17 +90,6 @@ def _accessor(number: int, array: np.ndarray) -> dict[str, Any]:
     kind = array.dtype.str[1:]
     accessor = {"bufferView": number, "componentType": COMPONENTS[kind], "count": len(array)}
     return accessor | {"type": TYPES[array.shape[1]]} | ({"normalized": True} if kind in ("u1", "u2") else {})
-
-
-def _container(document: Mapping[str, Any], body: bytes) -> bytes:
-    """Return the content of a file with ``document`` and the buffer ``body``, which may be empty."""
-    text = json.dumps(document, separators=(",", ":")).encode("ascii")
-    text += b" " * (-len(text) % 4)
-    chunks = [CHUNK.pack(len(text), b"JSON"), text]
-    if body:
-        chunks += [CHUNK.pack(len(body), b"BIN\0"), body]
-    length = HEADER.size + sum(map(len, chunks))
-    return b"".join([HEADER.pack(b"glTF", 2, length), *chunks])
 
 
 def linear(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:

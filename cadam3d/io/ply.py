@@ -101,23 +101,19 @@ def read_ply(path: Path, *, up: str = "-y") -> Gaussians:
         some = table[rows]
         higher = columns(some, rest).reshape(len(some), 3, size // 3).transpose(0, 2, 1)
         opacities = columns(some, COLUMNS["opacity_logits"])[:, 0]
+        # splat-transform 3.7.0 writes infinity when it unpacks the opacities 0 and 255 of a compressed PLY.
+        if not header.up:
+            limit = np.copysign(np.float32(INFINITE_LOGIT), opacities)
+            opacities = np.where(np.isinf(opacities), limit, opacities)
         return Gaussians(
             means=as_tensor(columns(some, COLUMNS["means"])),
             log_scales=as_tensor(columns(some, COLUMNS["log_scales"])),
             quats=as_tensor(columns(some, COLUMNS["quats"])),
-            opacity_logits=as_tensor(opacities if header.up else _finite_logits(opacities)),
+            opacity_logits=as_tensor(opacities),
             sh=as_tensor(np.concatenate([columns(some, SH0)[:, None], higher], axis=1)),
         )
 
     return gathered(path, len(table), header.up or up, local)
-
-
-def _finite_logits(logits: np.ndarray) -> np.ndarray:
-    """Return logits in which infinity, which means an opacity of 0 or 1, is a number with that meaning.
-
-    splat-transform 3.7.0 writes infinity when it unpacks the opacities 0 and 255 of a compressed PLY.
-    """
-    return np.where(np.isinf(logits), np.copysign(np.float32(INFINITE_LOGIT), logits), logits)
 
 
 def holds_gaussians(path: Path) -> bool:

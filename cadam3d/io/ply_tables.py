@@ -151,7 +151,12 @@ def _read_rows(header: PlyHeader, file: BinaryIO, element: Element) -> np.ndarra
         if len(record.names or ()) < len(element.properties):
             raise ValueError("expected numbers, got a list")
         if header.encoding == ASCII:
-            rows = _text_rows(file, element.count, record)
+            lines = islice((line for line in file if line.strip()), element.count)
+            with warnings.catch_warnings():
+                warnings.simplefilter(
+                    "ignore"
+                )  # about a file without any row, and numbers that are too large
+                rows = np.loadtxt(lines, dtype=record, comments=None, ndmin=1, encoding="latin-1")
         else:
             # A header may promise any number of rows, and reading them would allocate as much.
             length = min(element.count * record.itemsize, os.fstat(file.fileno()).st_size)
@@ -163,11 +168,3 @@ def _read_rows(header: PlyHeader, file: BinaryIO, element: Element) -> np.ndarra
         what = f"{element.count} rows of element {element.name[:40]}"
         raise unusable(header.path, f"truncated: the header promises {what}, the file holds {len(rows)}")
     return rows
-
-
-def _text_rows(file: BinaryIO, count: int, record: np.dtype) -> np.ndarray:
-    """Return up to ``count`` rows of text. Raises ``ValueError`` for anything but numbers."""
-    lines = islice((line for line in file if line.strip()), count)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about a file without any row, and numbers that are too large
-        return np.loadtxt(lines, dtype=record, comments=None, ndmin=1, encoding="latin-1")

@@ -25,7 +25,8 @@ MOST = 10_000  # prompts in a file
 # must not be longer than 128 KiB on Linux.
 LONGEST = 10_000
 # Composite prompts of threestudio refer to its own library in this way, by some words of a prompt.
-REFERENCE = "lib:"
+# Three question marks are a missing value of a configuration.
+NOT_PROMPTS = ("lib:", "???")
 EXAMPLE = "cadam3d sweep prompts=paper50"
 KEYS = ", ".join(("prompt", *SETTINGS, "name", "category"))
 
@@ -128,7 +129,8 @@ def _prompt(place: str, entry: Any, category: str) -> Prompt:
     try:
         found = TypeAdapter(_Entry).validate_python({"category": category} | keys)
         texts = [text for text in vars(found).values() if text is not None]
-        if not found.prompt or not all(map(_is_plain, texts)):
+        is_plain = all(is_readable(text) and not text.startswith(NOT_PROMPTS) for text in texts)
+        if not found.prompt or not is_plain:
             raise ValueError
     except ValueError as error:
         expected = f"a prompt as plain text of at most {LONGEST} characters, or texts for {KEYS}"
@@ -140,7 +142,3 @@ def _prompt(place: str, entry: Any, category: str) -> Prompt:
         name=found.name or "",
         category=found.category or "",
     )
-
-
-def _is_plain(text: str) -> bool:
-    return is_readable(text) and text != "???" and not text.startswith(REFERENCE)

@@ -8,10 +8,10 @@ can describe gigabytes), and with a limited depth.
 import os
 import stat
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar
+from typing import Any, BinaryIO
 
 import yaml  # comes with OmegaConf
 
@@ -35,22 +35,18 @@ KINDS = {
 _SAFE: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
-class _Loader(_SAFE):
-    """Reads plain data. A date stays text, as OmegaConf reads and writes it."""
-
-    yaml_implicit_resolvers: ClassVar = {
-        first: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":timestamp")]
-        for first, resolvers in _SAFE.yaml_implicit_resolvers.items()
+def _loader(is_used: Callable[[str], bool]) -> Any:
+    """Return a loader of plain data, in which values without a used tag are text."""
+    resolvers = {
+        first: [(tag, pattern) for tag, pattern in found if is_used(tag.rpartition(":")[2])]
+        for first, found in _SAFE.yaml_implicit_resolvers.items()
     }
+    return type("Loader", (_SAFE,), {"yaml_implicit_resolvers": resolvers})
 
 
-class _TextLoader(_SAFE):
-    """Reads every value except null as text."""
-
-    yaml_implicit_resolvers: ClassVar = {
-        first: [(tag, pattern) for tag, pattern in resolvers if tag.endswith(":null")]
-        for first, resolvers in _SAFE.yaml_implicit_resolvers.items()
-    }
+# A date stays text, as OmegaConf reads and writes it.
+_Loader = _loader(lambda name: name != "timestamp")
+_TextLoader = _loader(lambda name: name == "null")
 
 
 def unusable(path: Path, problem: str) -> UserError:
