@@ -109,8 +109,8 @@ class ScoreMetric(Metric):
             return None
         from scipy.stats import t  # slow to import
 
-        error = float(values.std()) / math.sqrt(len(values))
-        mean, half = float(values.mean()), float(t.ppf((1 + LEVEL) / 2, len(values) - 1)) * error
+        count, mean = len(values), float(values.mean())
+        half = float(t.ppf((1 + LEVEL) / 2, count - 1)) * float(values.std()) / math.sqrt(count)
         of = "the mean over viewpoints, by Student's t"
         return {"low": mean - half, "high": mean + half, "level": LEVEL, "of": of}
 
