@@ -2,6 +2,7 @@
 
 import errno
 import gc
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -9,7 +10,7 @@ from importlib import import_module
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from cadam3d.core.checks import fail
+from cadam3d.core.checks import fail, require
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import RUN_FOLDER, expanded
 from cadam3d.settings.advice import explain, line_of
@@ -30,7 +31,6 @@ from cadam3d.sweep.plan import require_attempts
 
 TRAINING = ("train", "sweep")  # the commands that have a run folder
 EXPORTING = ("render", "export")  # the commands with output=
-COMPARING = "render"  # the command that accepts several runs
 
 
 def launch(command: str, words: Sequence[str]) -> int:
@@ -102,6 +102,9 @@ def explaining(command: str, words: Sequence[str]) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
+        # The clean-up of OmegaConf can raise after an interrupt.
+        if isinstance(error.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from error
         if advice := explain(error, command, words):
             raise advice from error
         raise
@@ -159,8 +162,8 @@ def _composed(line: Line) -> DictConfig:
     require_effective(cfg, line.command, own)
     require_settings(cfg)
     runs = cfg.get("run")
-    if line.command != COMPARING and OmegaConf.is_list(runs):
-        raise fail("run", expected="one run", got=[*runs], example=f"run={runs[0]}")
+    is_comparison = OmegaConf.is_list(runs) and line.command != "render"
+    require(not is_comparison, "run", expected="one run", got=runs, example="run=outputs/latest")
     if is_training:
         require_attempts(cfg.get("attempts", 1))
     if of_sweeps and cfg.get("attempts", 1) == 1:
@@ -172,8 +175,7 @@ def _composed(line: Line) -> DictConfig:
 def _call(line: Line, cfg: DictConfig) -> Call:
     """Return how a line calls its command, and remove Hydra's own node from ``cfg``, in place."""
     text = OmegaConf.select(cfg, RUN_FOLDER)
-    if not text:
-        raise UserError(f"{RUN_FOLDER}: expected a folder, got nothing. Try: {RUN_FOLDER}=outputs/mine")
+    require(bool(text), RUN_FOLDER, expected="a folder", got=text, example=f"{RUN_FOLDER}=outputs/mine")
     with open_dict(cfg):
         return Call(
             words=line.words,
@@ -188,10 +190,10 @@ def _refuse_words(line: Line) -> None:
     command = line.command
     for word in line.words:
         key = key_of(word)
-        if "=" not in word and not word.startswith("~"):
-            expected = "key=value, in quotes if it has spaces"
-            raise fail(repr(word), expected=expected, got=word, example=f"cadam3d {command} --help")
-        if key.partition(".")[0].partition("/")[0] == "hydra" and not HYDRA_KEYS.match(key):
+        is_override = "=" in word or word.startswith("~")
+        expected = "key=value, in quotes if it has spaces"
+        require(is_override, repr(word), expected=expected, got=word, example=f"cadam3d {command} --help")
+        if re.split(r"[./]", key)[0] == "hydra" and not HYDRA_KEYS.match(key):
             raise UserError(f"{key}: cadam3d has no such setting of Hydra. Try: {RUN_FOLDER}=outputs/mine")
     if line.is_sweep and command not in TRAINING:
         raise UserError(f"{command}: only training can be swept. Try: cadam3d {command} --help")

@@ -33,25 +33,13 @@ REPOSITORY = Path(__file__).parent.parent
 DENSIFIERS = sorted(path.stem for path in (options.config_dir() / "densifier").glob("*.yaml"))
 AWKWARD = (
     "a corgi, front view",
-    "what's up",
-    "a car (red)",
-    "a [small] {blue} cube",
-    "a=b",
-    "a torus with emoji 😀",
-    "一座灯塔",
+    "what's up with a=b and [small] {blue} (red)",
+    "a torus with emoji 😀 and 一座灯塔",
     "null",
-    "true",
     "12",
-    "a backslash \\ inside",
-    "ends with a backslash \\",
-    "a \\' both",
-    "${oc.env:HOME}",
-    "\\${escaped} and ${open",
-    '"half quoted',
-    "'a' and 'b'",
-    "colon: hash # percent %",
-    " spaces around ",
-    "two\nlines",
+    "a \\' both and a backslash at the end \\",
+    "\\${escaped}, ${oc.env:HOME} and ${open",
+    " 'half quoted: hash # percent %\n",
     "???!",
 )
 
@@ -133,10 +121,6 @@ def test_help_shows_every_command_on_one_line(type_line):
     assert max(len(line) for line in result.out.splitlines()) <= 110
 
 
-def test_cadam3d_without_arguments_prints_the_help(type_line):
-    assert type_line() == type_line("--help")
-
-
 def test_version(type_line):
     assert type_line("--version").out.startswith("cadam3d 0.")
 
@@ -187,11 +171,6 @@ def test_a_prompt_is_unchanged_in_the_command_and_in_the_config_of_its_run(promp
     assert settings.load_config(path).prompt == prompt
 
 
-def test_a_negative_prompt_is_text_too(type_line, jobs):
-    assert type_line("train", "prompt=a cube", "negative_prompt=blurry, (low) quality=1").code == 0
-    assert jobs[0][0].negative_prompt == "blurry, (low) quality=1"
-
-
 def test_quoting_is_undone_by_hydra_and_omegaconf_for_any_text():
     letters = ["\\", "'", '"', "${", "}", "$", "{", ",", "(", "]", "=", " ", "a", "\u65e5", "\n", "#", "?"]
     draw = random.Random(0)
@@ -200,12 +179,6 @@ def test_quoting_is_undone_by_hydra_and_omegaconf_for_any_text():
         text = "".join(draw.choices(letters, k=draw.randint(0, 9)))
         value = parser.parse_override(f"prompt={settings.quote(text)}").value()
         assert text == "???" or OmegaConf.create({"prompt": value}).prompt == text
-
-
-@pytest.mark.parametrize("quoted", ["'a corgi, front view'", '"a corgi, front view"'])
-def test_a_prompt_that_is_quoted_already_is_left_alone(quoted, type_line, jobs):
-    type_line("train", f"prompt={quoted}")
-    assert jobs[0][0].prompt == "a corgi, front view"
 
 
 @pytest.mark.parametrize(
@@ -268,12 +241,6 @@ def test_hydra_full_error_shows_the_traceback(monkeypatch, tmp_path):
     assert caught.value.__cause__ is not None
 
 
-def test_a_mistake_found_by_the_command_itself_is_one_message_too(type_line, jobs):
-    jobs.refusal = UserError("seed: 7 is unlucky. Try: seed=0")
-    result = type_line("train", "prompt=a cube")
-    assert (result.code, result.message) == (1, "seed: 7 is unlucky. Try: seed=0")
-
-
 @pytest.mark.parametrize("bug", [ValueError("a bug"), ConfigAttributeError("a bug")])
 def test_a_bug_keeps_its_traceback(bug, monkeypatch, tmp_path, jobs):
     monkeypatch.chdir(tmp_path)
@@ -300,24 +267,18 @@ def test_a_run_gets_a_dated_folder_named_after_its_prompt(type_line, jobs, tmp_p
     assert (folder / "train.log").is_file()
 
 
-@pytest.mark.parametrize("place", [(), ("hydra.run.dir=deep/down/here",)])
-def test_a_refused_line_leaves_no_folder_behind(place, type_line, jobs, tmp_path):
+def test_a_refused_line_makes_no_folder_and_removes_none(type_line, jobs, tmp_path):
     jobs.refusal = UserError("x")
-    assert type_line("train", "prompt=a cube", *place).code == 1
-    assert len(jobs) == 1
+    assert type_line("train", "prompt=a cube").message == "x"
     assert not list(tmp_path.iterdir())
-
-
-def test_a_refused_line_removes_no_older_folder(type_line, jobs, tmp_path):
     (tmp_path / "mine").mkdir()
-    jobs.refusal = UserError("x")
     for place in ("mine/deep/er", "mine"):
         assert type_line("train", "prompt=a cube", f"hydra.run.dir={place}").code == 1
     assert [path.name for path in tmp_path.rglob("*")] == ["mine"]
 
 
 @pytest.mark.parametrize("is_resumed", [False, True])
-@pytest.mark.parametrize("problem", [UserError("x"), ValueError("a bug"), KeyboardInterrupt(), SystemExit(3)])
+@pytest.mark.parametrize("problem", [ValueError("a bug"), KeyboardInterrupt()])
 def test_a_run_that_does_not_begin_leaves_the_folder_as_it_was(
     problem, is_resumed, type_line, jobs, tmp_path
 ):
@@ -479,19 +440,11 @@ def complete(line: str, type_line, monkeypatch, shell: str = "bash") -> list[str
         ("cadam3d sweep launcher=jo", ["launcher=joblib"]),
         ("cadam3d doctor js", ["json="]),
         ("cadam3d nothing ", []),
+        ("cadam3d train densifier=nope step", []),
     ],
 )
 def test_the_command_and_the_words_after_it_are_completed(line, expected, type_line, monkeypatch):
     assert complete(line, type_line, monkeypatch) == expected
-
-
-def test_completion_of_a_wrong_line_is_silent(type_line, monkeypatch):
-    assert complete("cadam3d train densifier=nope steps", type_line, monkeypatch) in ([], ["steps="])
-
-
-def test_fish_gets_one_command_per_line(type_line, monkeypatch):
-    monkeypatch.setenv("COMP_LINE", "cadam3d ")
-    assert type_line("-sc", "query=fish").out.splitlines() == list(cli.COMMANDS)
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
@@ -541,6 +494,17 @@ def test_ctrl_c_prints_one_line_and_exits_with_130(tmp_path):
     _, err = process.communicate(timeout=30)
     assert process.returncode == 130
     assert err.strip() == "cadam3d: interrupted"
+
+
+def test_an_interrupt_hidden_by_another_exception_is_still_an_interrupt(type_line, monkeypatch, jobs):
+    def hide(*args, **kwargs):
+        try:
+            raise KeyboardInterrupt
+        finally:
+            raise AttributeError("raised by the clean-up")
+
+    monkeypatch.setattr("cadam3d.launch.compose_line", hide)
+    assert type_line("train", "prompt=a cube").code == 130
 
 
 def test_a_run_composes_its_settings_once(type_line, jobs, monkeypatch):

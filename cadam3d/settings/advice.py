@@ -13,7 +13,7 @@ from cadam3d.core.checks import nearest
 from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import NO_NAME_COMPLAINT, compose, flatten, quote
 from cadam3d.settings.line import key_of
-from cadam3d.settings.options import default_option, option_names, unknown_option
+from cadam3d.settings.options import default_options, option_names, unknown_option
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
 # The choice of an option or of a list of options.
@@ -117,6 +117,6 @@ def _known_keys(wrong: str, command: str, words: Sequence[str]) -> list[str]:
 def _several_values(override: str, command: str) -> UserError:
     """Explain that several values need a sweep, or brackets if they are options of a list."""
     key, _, value = override.partition("=")
-    if isinstance(default_option(key), list) or command not in ("train", "sweep"):
+    if isinstance(default_options().get(key), list) or command not in ("train", "sweep"):
         return UserError(f"{key}: a list has brackets. Try: {shlex.quote(f'{key}=[{value}]')}")
     return UserError(f"{key}: several values make a sweep. Try: {line_of('sweep', [override])}")

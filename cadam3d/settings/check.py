@@ -28,7 +28,6 @@ from cadam3d.settings.compose import flatten
 from cadam3d.settings.line import key_of
 from cadam3d.settings.options import (
     NOTHING,
-    REFERENCE,
     TARGET,
     config_dir,
     declared_names,
@@ -37,6 +36,7 @@ from cadam3d.settings.options import (
     option_word,
 )
 
+REFERENCE = re.compile(r"\$\{([\w.]+)\}")
 # The groups of which several options can be chosen.
 LISTS = ("regularizer", "exporter", "callback", "metric")
 # Integers beyond this fit into no tensor.

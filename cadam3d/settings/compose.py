@@ -60,43 +60,33 @@ class Call:
 
 def compose_line(config_name: str, overrides: Sequence[str], options: Namespace) -> DictConfig:
     """Return the configuration of a line, with Hydra's own node. Raises Hydra's exceptions."""
-    return compose(
-        overrides,
-        options.config_name or config_name,
-        folder=Path(options.config_path) if options.config_path else None,
-        search_path=options.config_dir,
-        with_hydra=True,
-    )
+    name = options.config_name or config_name
+    return compose(overrides, name, search_path=options.config_dir, with_hydra=True)
 
 
 def compose(
     overrides: Sequence[str] = (),
     config_name: str = "train",
     *,
-    folder: Path | None = None,
     search_path: str | None = None,
     with_hydra: bool = False,
 ) -> DictConfig:
     """Return the configuration that ``cadam3d <config_name> <overrides>`` would run with.
 
-    ``folder`` replaces :func:`config_dir`, ``search_path`` is one more folder of YAML files, ``with_hydra``
-    keeps Hydra's own node. Raises Hydra's exceptions; ``cadam3d.settings.advice`` explains them to the user.
+    ``search_path`` is one more folder of YAML files, and ``with_hydra`` keeps Hydra's own node. Raises
+    Hydra's exceptions; ``cadam3d.settings.advice`` explains them to the user.
     """
     register_resolvers()
-    place = (folder or config_dir()).resolve()
-    for flag, chosen in (("--config-path", place), ("--config-dir", Path(search_path or "."))):
-        require(chosen.is_dir(), flag, expected="a folder", got=str(chosen), example=f"{flag}=.")
     words = list(overrides)
     if search_path is not None:
-        words = [word for word in words if not word.startswith(f"{SEARCH_PATH}=")]
-        parser = OverridesParser.create()
-        more = [
-            path for word in overrides if word not in words for path in parser.parse_override(word).value()
-        ]
-        places = [f"file://{Path(search_path).absolute()}", *more]
-        words.append(f"{SEARCH_PATH}=[{','.join(map(quote, places))}]")
+        is_folder = Path(search_path).is_dir()
+        require(is_folder, "--config-dir", expected="a folder", got=search_path, example="--config-dir=.")
+        typed = [word for word in words if word.startswith(f"{SEARCH_PATH}=")]
+        more = [path for word in typed for path in OverridesParser.create().parse_override(word).value()]
+        places = ",".join(map(quote, [f"file://{Path(search_path).absolute()}", *more]))
+        words = [*(word for word in words if word not in typed), f"{SEARCH_PATH}=[{places}]"]
     try:
-        with _own_hydra(place):
+        with _own_hydra():
             cfg = hydra.compose(config_name, words, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, UserError):
         raise
@@ -114,13 +104,15 @@ def compose(
 
 
 @contextmanager
-def _own_hydra(folder: Path) -> Iterator[None]:
-    """Initialize Hydra with a folder of YAML files, and restore the calling program's folder afterwards."""
+def _own_hydra() -> Iterator[None]:
+    """Initialize Hydra with the package's folder, and restore that of the calling program afterwards."""
     outer, version = GlobalHydra.instance().hydra, VersionBase.instance().version_base
     GlobalHydra.instance().clear()
     try:
         name = JobRuntime.instance().get("name")
-        with hydra.initialize_config_dir(str(folder), job_name=name, version_base=VERSION_BASE):
+        with hydra.initialize_config_dir(
+            str(config_dir().resolve()), job_name=name, version_base=VERSION_BASE
+        ):
             yield
     finally:
         GlobalHydra.instance().hydra = outer

@@ -48,7 +48,7 @@ class Setting:
     key: str  # as in a command line, such as "camera.fov_y_deg"
     # As it is typed, or the call that builds an object, such as "Linear(start=0.98, end=0.5, steps=500)".
     value: str
-    words: str
+    words: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,6 @@ class Option:
     about: str  # paragraphs between empty lines; a line that begins with a space is an example
     base: str = ""  # the option of the same group that this one builds on, or ""
     settings: tuple[Setting, ...]
-    changed: tuple[str, ...] = ()  # keys to which the file itself gives a value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,16 +114,11 @@ class Library:
         An option may also change settings and groups elsewhere, which are described in their own group.
         """
         path = option_file(group, name, self.folders)
-        values, content = read_option(group, name, self.folders), read_yaml(path)
+        values = read_option(group, name, self.folders)
         values.pop("hydra", None)
-        bases, choices = _defaults(content)
-        chosen = [
-            Setting(key=key, value=spelled(value), words="")
-            for key, value in choices.items()
-            if key in self.options
-        ]
-        own = {key: value for key, value in content.items() if key != "defaults"}
-        changed = _settings(own, {}, "".join(f"{part}." for part in package_of(group, path)))
+        bases, choices = _defaults(read_yaml(path))
+        groups = choices.keys() & self.options.keys()
+        chosen = [Setting(key=key, value=spelled(value)) for key, value in choices.items() if key in groups]
         words = {
             key: self._words_by_class.get((target, key.rpartition(".")[2]), "")
             for key, target in _keys_by_class(values)
@@ -133,7 +127,6 @@ class Library:
             about=about_of(path),
             base=next((base for base in bases if "/" not in base), ""),
             settings=(*chosen, *_settings(values, words | self._words(group, name))),
-            changed=(*choices, *(each.key for each in changed)),
         )
 
     def _words(self, group: str, name: str) -> dict[str, str]:
@@ -293,8 +286,9 @@ def _option(library: Library, group: str, name: str) -> str:
     option = library.option(group, name)
     lines = [f"{group}={name}", _wrapped(option.about)]
     if option.base:
-        changed = ", ".join(key.removeprefix(f"{group}.") for key in option.changed)
-        lines.append(_wrapped(f"Builds on {group}={option.base} and changes {changed}."))
+        base = library.option(group, option.base).settings
+        changed = [each.key.removeprefix(f"{group}.") for each in option.settings if each not in base]
+        lines.append(_wrapped(f"Builds on {group}={option.base} and changes {', '.join(changed)}."))
     return "\n".join([*lines, _table(map(_row, option.settings)) or "  It has no settings."])
 
 

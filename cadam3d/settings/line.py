@@ -65,8 +65,7 @@ class Line:
     @property
     def folders(self) -> list[Path]:
         """Return the folders of YAML files, in the order in which Hydra searches them."""
-        own = [Path(self.options.config_dir)] if self.options.config_dir else []
-        return [*own, Path(self.options.config_path) if self.options.config_path else config_dir()]
+        return [Path(self.options.config_dir), config_dir()] if self.options.config_dir else [config_dir()]
 
     @property
     def trusting(self) -> str:
@@ -88,7 +87,7 @@ def read_flags(words: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for names in ("--help -h", "--hydra-help", "--multirun -m", "--resolve"):
         parser.add_argument(*names.split(), action="store_true")
-    for names in ("--package -p", "--config-path -cp", "--config-name -cn", "--config-dir -cd"):
+    for names in ("--package -p", "--config-name -cn", "--config-dir -cd"):
         parser.add_argument(*names.split())
     parser.add_argument("--cfg", "-c", choices=("job", "hydra", "all"))
     pages = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")

@@ -8,7 +8,6 @@ package. Nothing is composed here.
 import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from functools import cache
 from inspect import isabstract, isclass
 from pathlib import Path
@@ -28,7 +27,6 @@ NOTHING = "???"  # a value that the user has to give
 CHOSEN = {"prompt": "a red torus", "run": LATEST, "resume": LATEST}
 # What Hydra reads in the first line of a YAML file.
 PACKAGE = re.compile(r"#\s*@package\s+(\S+)")
-REFERENCE = re.compile(r"\$\{([\w.]+)\}")
 
 
 def config_dir() -> Path:
@@ -127,11 +125,6 @@ def declared_names(command: str) -> set[str]:
     return settings.union(default_options(command)) - {"defaults"}
 
 
-def default_option(group: str, command: str = "train") -> str | list[str] | None:
-    """Return the option of a group that a command has by default; None if it has none."""
-    return default_options(command).get(group)
-
-
 def option_word(key: str, command: str = "train") -> str:
     """Return an argument that chooses an option for the slot ``key``, such as ``camera=orbit``.
 
@@ -139,40 +132,25 @@ def option_word(key: str, command: str = "train") -> str:
     """
     group = key.removesuffix(f".{TARGET}").replace(".", "/")
     if names := option_names(group):
-        return shlex.quote(f"{group}={spelled(default_option(group, command) or names[0])}")
+        return shlex.quote(f"{group}={spelled(default_options(command).get(group) or names[0])}")
     return f"~{key}"
-
-
-def example_value(key: str) -> Any:
-    """Return a value of the setting ``key``, such as ``densifier.tau_Q``, from the YAML files of the package.
-
-    This is the value of the default option, or of another one of its group. Raises ``LookupError`` if no file
-    has a value that a user can type.
-    """
-    for values in _places(key):
-        found = _inside(values, key.split("."))
-        if reference := REFERENCE.fullmatch(str(found)):
-            with suppress(LookupError):
-                return example_value(reference.group(1))
-        elif not isinstance(found, dict) and NOTHING not in str(found) and "${" not in str(found):
-            return found
-    raise LookupError(key)
 
 
 @cache
 def example_word(key: str) -> str:
-    """Return ``key=value`` with an example, as it is typed into a shell.
+    """Return ``key=value`` with a value from the YAML files of the package, as it is typed into a shell.
 
-    For the slot of a group, and without an example, this is an argument that chooses an option of the group;
-    "" outside of all groups.
+    This is the value of the default option, or of another one of its group. For the slot of a group, and
+    without such a value, it is an argument that chooses an option of the group; "" outside of all groups.
     """
     if option_names(key.replace(".", "/")):
         return option_word(key)
-    try:
-        return shlex.quote(f"{key}={spelled(example_value(key))}")
-    except LookupError:
-        root = key.partition(".")[0]
-        return option_word(root) if option_names(root) else ""
+    for values in _places(key):
+        found = _inside(values, key.split("."))
+        if not isinstance(found, dict) and NOTHING not in str(found) and "${" not in str(found):
+            return shlex.quote(f"{key}={spelled(found)}")
+    root = key.partition(".")[0]
+    return option_word(root) if option_names(root) else ""
 
 
 def with_example(error: UserError) -> UserError:
@@ -211,7 +189,7 @@ def _places(key: str) -> Iterator[dict[str, Any]]:
     """Yield the nested values of every YAML file that may have a setting, the likeliest first."""
     yield CHOSEN
     group, member, *_ = [*key.split("."), ""]
-    names, chosen = option_names(group), default_option(group)
+    names, chosen = option_names(group), default_options().get(group)
     if not names:
         for path in sorted(config_dir().glob("*.yaml"), key=lambda path: path.stem != "train"):
             yield read_yaml(path)

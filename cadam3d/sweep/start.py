@@ -47,7 +47,7 @@ from cadam3d.sweep.progress import reporting, time_left
 from cadam3d.sweep.table import as_text, listing, write_table
 
 LONGEST = 40  # rows of a table in the terminal
-FOLDER_FLAGS = ("--config-dir", "-cd", "--config-path", "-cp")
+FOLDER_FLAGS = ("--config-dir", "-cd")
 # The flags of a sweep that its jobs need too.
 JOB_FLAGS = (*FOLDER_FLAGS, "--config-name", "-cn")
 

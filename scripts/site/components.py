@@ -51,13 +51,15 @@ def group(library: Library, name: str, chosen: tuple[str, ...]) -> str:
         lines.append(f"| `{each}`{mark} | {cell(option.about)} |")
     blocks = ["\n".join(lines)]
     if name not in LISTED_ONLY:
-        blocks += [block for each, option in options.items() if (block := settings(name, each, option))]
+        for each, option in options.items():
+            base = options[option.base].settings if option.base else ()
+            blocks += [block] if (block := settings(name, each, option, base)) else []
     return "\n\n".join(blocks)
 
 
-def settings(name: str, chosen: str, option: Option) -> str:
-    """Return the settings of an option in a folded section: only the changed ones if it has a base."""
-    own = [each for each in option.settings if not option.base or each.key in option.changed]
+def settings(name: str, chosen: str, option: Option, base: tuple[Setting, ...]) -> str:
+    """Return the settings of an option in a folded section, without those of the option it builds on."""
+    own = [each for each in option.settings if each not in base]
     if not own:
         return ""
     title = f"<code>{name}={chosen}</code>"

@@ -67,7 +67,7 @@ def test_an_option_of_another_folder_comes_before_that_of_the_package(tmp_path):
         ("densifier.tau_Q", "densifier.tau_Q=0.9"),
         ("densifier.cap", "densifier.cap=20000"),
         ("exporter.mesh.format", "exporter.mesh.format=glb"),
-        ("optimizer.means_lr.steps", "optimizer.means_lr.steps=600"),
+        ("optimizer.means_lr.steps", "optimizer=adam"),
         ("optimizer.means_lr", "optimizer=adam"),
         ("prompt", "'prompt=a red torus'"),
         ("size", "size=384"),
