@@ -206,7 +206,7 @@ class LatentPrior(DiffusionPrior):
         pixels = self.size or size or 512
         vae = self.found.skeleton("vae", self._vae_dtype)
         network = self.found.skeleton(self.network_part, self.torch_dtype)
-        numbers = self._at_once(views) * pixels**2 * vae.config.block_out_channels[0] * KEPT
+        numbers = min(views, self.micro_batch or views) * pixels**2 * vae.config.block_out_channels[0] * KEPT
         is_known = all(map(self._cache.has, self._listed(prompt, negative)))
         is_elsewhere = self.text_device == "cpu" and self.device.type != "cpu"
         encoders = [part for part in self.encoders if self.found.has(part)]
@@ -367,10 +367,7 @@ class LatentPrior(DiffusionPrior):
         return torch.cat(outputs)
 
     def _parts(self, rows: Tensor) -> Sequence[Tensor]:
-        return rows.split(self._at_once(len(rows)))
-
-    def _at_once(self, images: int) -> int:
-        return min(images, self.micro_batch or images)
+        return rows.split(self.micro_batch or len(rows))
 
     def _listed(self, prompt: str, negative: str) -> list[str]:
         return [*self.prompting.texts(prompt), negative, ""]

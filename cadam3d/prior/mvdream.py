@@ -107,7 +107,14 @@ class MVDream(StableDiffusion):
         checked = vars(self).get("checked", 0)
         if t.device.type == "cpu" or checked < CHECKED:
             vars(self)["checked"] = checked + 1
-            require_one_level(t)
+            levels = t.view(-1, VIEWS)
+            require(
+                bool((levels == levels[:, :1]).all()),
+                "guidance.shared_t",
+                expected="true, since prior=mvdream denoises four views together at one noise level",
+                got=False,
+                example="guidance.shared_t=true",
+            )
         return super().predict(noisy, t, condition, scale)
 
     def tempered(self, noisy: Latents, guided: Prediction, output: Latents, t: PerView) -> Prediction:
@@ -137,18 +144,6 @@ def camera_numbers(cameras: Cameras) -> Float[Tensor, "v 16"]:
     views = len(cameras)
     last = torch.cat([to_world.new_zeros(views, 1, 3), to_world.new_ones(views, 1, 1)], dim=2)
     return torch.cat([torch.cat([axes, centres[..., None]], dim=2), last], dim=1).flatten(1)
-
-
-def require_one_level(t: PerView) -> None:
-    """Raise ``UserError`` unless the views of each group have one noise level."""
-    levels = t.view(-1, VIEWS)
-    require(
-        bool((levels == levels[:, :1]).all()),
-        "guidance.shared_t",
-        expected="true, since prior=mvdream denoises four views together at one noise level",
-        got=False,
-        example="guidance.shared_t=true",
-    )
 
 
 def require_whole_groups(views: int) -> None:

@@ -35,11 +35,8 @@ ERROR_FREQUENCY = 3.0
 class Census:
     """Moments of premultiplied RGB and alpha over all images of the world, per pixel of a small picture."""
 
-    rgb: Float[Tensor, "3 s s"]
-    alpha: Float[Tensor, "s s"]
-    rgb_variance: Float[Tensor, "3 s s"]
-    alpha_variance: Float[Tensor, "s s"]
-    covariance: Float[Tensor, "3 s s"]  # of each colour with alpha
+    # Means of RGB and alpha, their variances, and the covariances of each colour with alpha.
+    maps: Float[Tensor, "11 s s"]
 
     def mixture(self, cameras: Cameras, background: Float[Tensor, "v 3"], floor: float) -> Mixture:
         """Return one Gaussian per pixel over the given backgrounds, in model space.
@@ -261,9 +258,8 @@ def _bicubic(size: int, dtype: torch.dtype, device: torch.device) -> Float[Tenso
 def _enlarged(
     census: Census, size: tuple[int, int], dtype: torch.dtype, device: torch.device
 ) -> Float[Tensor, "1 11 h w"]:
-    """Return the maps of a census, in the order of their fields, at the size of an image."""
-    maps = [census.rgb, census.alpha[None], census.rgb_variance, census.alpha_variance[None]]
-    maps = torch.cat([*maps, census.covariance])[None].to(device, dtype)
+    """Return the maps of a census at the size of an image."""
+    maps = census.maps[None].to(device, dtype)
     return torch.nn.functional.interpolate(maps, size, mode="bilinear", align_corners=False)
 
 
@@ -271,11 +267,11 @@ def _enlarged(
 def take_census(size: int, tracer: str) -> Census:
     """Return the moments over all objects of the world, a few views of each and all modes, equally likely."""
     name = f"census-{size}-{find_tracer(tracer).identity}"
-    return Census(**stored_arrays(name, lambda: _measure(size, tracer)))
+    return Census(**stored_arrays(name, lambda: {"maps": _measure(size, tracer)}))
 
 
-def _measure(size: int, tracer: str) -> dict[str, Tensor]:
-    """Compute the census by tracing every object, and return its maps by name."""
+def _measure(size: int, tracer: str) -> Float[Tensor, "11 s s"]:
+    """Return the maps of the census, computed by tracing every object."""
     cameras = turntable(
         CENSUS_VIEWS,
         elevation_deg=CENSUS_ELEVATION_DEG,
@@ -298,11 +294,6 @@ def _measure(size: int, tracer: str) -> dict[str, Tensor]:
         alpha_sum += alpha.mean(0)
         alpha_square += alpha.square().mean(0)
     count = len(names)
-    rgb, alpha = rgb_sum / count, alpha_sum / count
-    return {
-        "rgb": rgb,
-        "alpha": alpha,
-        "rgb_variance": rgb_square / count - rgb**2,
-        "alpha_variance": alpha_square / count - alpha**2,
-        "covariance": cross / count - rgb * alpha,
-    }
+    rgb, alpha = rgb_sum / count, alpha_sum[None] / count
+    rgb_variance, alpha_variance = rgb_square / count - rgb**2, alpha_square[None] / count - alpha**2
+    return torch.cat([rgb, alpha, rgb_variance, alpha_variance, cross / count - rgb * alpha])
