@@ -15,6 +15,7 @@ from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require, require_choice, require_range
+from cadam3d.prior.path import PerView
 
 FRONT, SIDE, BACK, OVERHEAD = range(4)
 SUFFIXES = (", front view", ", side view", ", back view", ", overhead view")
@@ -222,7 +223,7 @@ def guide(
     return negative + scale * total
 
 
-def _lucid_strengths(rho: Float[Tensor, "v"], first: bool) -> Float[Tensor, "v 2"]:
+def _lucid_strengths(rho: PerView, first: bool) -> Float[Tensor, "v 2"]:
     if first:
         front = torch.where(rho > 0.8, 0.0, -2 * torch.exp(-2 * rho))
         side = torch.where(rho < 0.2, 0.0, -2 * torch.exp(-10 * (1 - rho)))
@@ -231,8 +232,8 @@ def _lucid_strengths(rho: Float[Tensor, "v"], first: bool) -> Float[Tensor, "v 2
     return torch.stack([side, torch.full_like(rho, -2.0)], dim=-1)
 
 
-def _threestudio_strengths(rho: Float[Tensor, "v"], first: bool) -> Float[Tensor, "v 2"]:
-    def curve(a: float, c: float, r: Float[Tensor, "v"]) -> Float[Tensor, "v"]:
+def _threestudio_strengths(rho: PerView, first: bool) -> Float[Tensor, "v 2"]:
+    def curve(a: float, c: float, r: PerView) -> PerView:
         return -(a * torch.exp(-0.5 * r) + c)
 
     if first:
@@ -240,7 +241,7 @@ def _threestudio_strengths(rho: Float[Tensor, "v"], first: bool) -> Float[Tensor
     return torch.stack([curve(1, -0.606, rho), curve(1, 0.967, rho)], dim=-1)
 
 
-def _around(azimuth_deg: Float[Tensor, "v"], k: int) -> Float[Tensor, "v k"]:
+def _around(azimuth_deg: PerView, k: int) -> Float[Tensor, "v k"]:
     """Interpolate between the front at 0, the side at 90 and the back at 180 degrees, on either side."""
     position = azimuth_deg.abs() / QUARTER
     weights = azimuth_deg.new_zeros(len(azimuth_deg), k)

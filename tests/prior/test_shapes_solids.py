@@ -62,7 +62,7 @@ def test_every_kind_is_tested_in_this_file() -> None:
 @pytest.mark.parametrize("name", VOLUMES)
 def test_inside_has_the_volume_of_the_textbook(name: str) -> None:
     solid, volume = VOLUMES[name]
-    points = random_points(150_000)
+    points = random_points(60_000)
     share = float((solid.distance(points) < 0).double().mean())
     error = math.sqrt(volume / 8 * (1 - volume / 8) / points.shape[1])
     assert abs(share - volume / 8) < 4 * error
