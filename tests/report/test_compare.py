@@ -139,9 +139,7 @@ def test_noise_levels_and_objectives_do_not_count_as_prompts():
     assert found.p_value == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize(
-    ("prompts", "seeds", "least"), [(6, 1, 0.91), (6, 3, 0.87), (12, 1, 0.92), (12, 3, 0.9)]
-)
+@pytest.mark.parametrize(("prompts", "seeds", "least"), [(6, 3, 0.87), (12, 1, 0.92)])
 def test_an_interval_covers_the_truth_as_often_as_the_documentation_says(prompts, seeds, least):
     """The truth is 0; seeds vary half as much as prompts."""
     rng = np.random.default_rng(0)
