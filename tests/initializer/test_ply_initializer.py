@@ -202,12 +202,6 @@ def test_points_are_upright(tmp_path, up, world):
     torch.testing.assert_close(build(point_cloud(tmp_path), up=up).means, POINTS[:, world])
 
 
-def test_a_cloud_of_point_e_gets_luciddreamers_size_and_height(tmp_path):
-    made = build(point_cloud(tmp_path), turn_deg=90, factor=2.0, lift=0.3)
-    torch.testing.assert_close(made.means[:, 2], 2 * POINTS[:, 2] + 0.3)
-    torch.testing.assert_close(made.means[:, 0], -2 * POINTS[:, 1])
-
-
 def test_points_are_scaled_before_they_are_replicated(tmp_path):
     made = build(point_cloud(tmp_path), radius=0.6, replicate=20, replicate_radius=0.01)
     assert len(made) == 800
@@ -258,8 +252,8 @@ def test_an_impossible_value_is_refused_by_name(key, value):
         ply("a.ply", **{key: value})
 
 
-@pytest.mark.parametrize("far", [1e25, 3e38])
-def test_an_asset_too_large_to_be_measured_is_refused_only_if_it_is_scaled(tmp_path, far):
+def test_an_asset_too_large_to_be_measured_is_refused_only_if_it_is_scaled(tmp_path):
+    far = 1e25
     huge = some_gaussians(3)
     huge.means[0] = -far
     huge.means[1] = far

@@ -12,7 +12,7 @@ import pytest
 from cadam3d.core.errors import UserError
 from cadam3d.io.lock import is_held, locked
 from cadam3d.io.occupied import occupied
-from cadam3d.io.run_folder import LOCK, claim, occupant
+from cadam3d.io.run_folder import LOCK, occupant
 from cadam3d.sweep import process
 from cadam3d.trainer import Trainer
 
@@ -214,18 +214,3 @@ def test_a_resumed_run_follows_no_link_out_and_waits_for_no_pipe(make, name, tmp
     message = type_line("train", f"resume={folder}").message
     assert f"{folder / name}: expected a " in message
     assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_a_name_is_claimed_by_one_process(tmp_path, monkeypatch):
-    """Between looking and creating, another process may take the name."""
-    made = []
-    mkdir = Path.mkdir
-
-    def slow(path, *args, **more):
-        if path.name == "run" and not made:
-            made.append(path)
-            mkdir(path)
-        return mkdir(path, *args, **more)
-
-    monkeypatch.setattr(Path, "mkdir", slow)
-    assert claim(tmp_path / "run", "key", is_chosen=False) == tmp_path / "run-2"
