@@ -209,7 +209,8 @@ class Asset:
         require_whole("height", height, low=1)
         title = self.title or UNTITLED
         page = viewer_page(pack(self.gaussians), title=title)
-        if is_notebook():
+        shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+        if hasattr(shell, "kernel"):
             from IPython.display import display
 
             frame = FRAME.format(page=html.escape(page), title=html.escape(title), height=height)
@@ -220,9 +221,3 @@ class Asset:
             temporary.write_text(page, encoding="utf-8")
         print(f"Open this in a browser: {path}")
         return path
-
-
-def is_notebook() -> bool:
-    """Return whether this process runs the cells of a notebook, which can show HTML."""
-    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    return hasattr(shell, "kernel")

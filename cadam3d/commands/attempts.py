@@ -9,10 +9,10 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from cadam3d import report
-from cadam3d.commands.beginning import link
 from cadam3d.core.errors import UserError
 from cadam3d.core.number import preferred
 from cadam3d.io.jsonl import write_json
+from cadam3d.io.links import link
 from cadam3d.io.run_folder import ASSET, BEST, CHOICE, LATEST, REPORT, setting_word, shown
 from cadam3d.sweep.choice import (
     Choice,

@@ -10,9 +10,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.commands.messages import note, note_backend
-from cadam3d.core.console import say
 from cadam3d.io.atomic import remove_leftovers, replacing
-from cadam3d.io.links import point
+from cadam3d.io.links import link
 from cadam3d.io.lock import INHERITED
 from cadam3d.io.run_folder import CONFIG, HYDRA_CONFIG, HYDRA_SETTINGS, LATEST, LOG, OVERRIDES
 from cadam3d.rasterizer.base import Backend
@@ -117,14 +116,6 @@ def begun(cfg: DictConfig, call: Call, folder: Path) -> Iterator[str]:
         if INHERITED not in os.environ:
             link(Path(LATEST), folder)
         yield config_text
-
-
-def link(name: Path, folder: Path) -> None:
-    """Make ``name`` a link to ``folder``. If that is not possible, print a note."""
-    try:
-        point(name, folder)
-    except OSError as error:
-        say(f"Note: {name} not updated ({error.strerror}).", logging.WARNING)
 
 
 @contextmanager

@@ -2,12 +2,11 @@
 
 import shlex
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig
 
 from cadam3d import report
@@ -71,6 +70,12 @@ def evaluate(cfg: DictConfig, call: Call, folder: Path) -> dict[str, Any]:
     source = PriorTruth() if node is None else component(node, TruthSource, "truth")
     truth = source.of(own.prompt, prior)
 
+    def start() -> Gaussians:
+        settings = components_of(("initializer",))
+        require_whole("seed", settings.seed, low=0)
+        initializer: Initializer = component(settings.initializer, Initializer, "initializer")
+        return rebuild_start(settings.prompt, initializer, settings.seed, device)
+
     warnings: list[str] = []
     # By these two numbers, readers of the file recognise whether it describes the present asset.
     result: dict[str, Any] = {"run": str(shown(folder)), "prompt": own.prompt}
@@ -86,7 +91,7 @@ def evaluate(cfg: DictConfig, call: Call, folder: Path) -> dict[str, Any]:
             truth=truth,
             asset=asset.file,
         ),
-        partial(start_of, components_of, device) if source.measures_start else None,
+        start if source.measures_start else None,
         warnings,
     )
     if warnings:
@@ -111,14 +116,6 @@ def _as_text(result: Mapping[str, Any]) -> str:
         how += [f"protocol={record['protocol']['name']}"] if "protocol" in record else []
         lines.append(f"{name:<20}{text}   {', '.join(filter(None, how))}".rstrip())
     return "\n".join(lines)
-
-
-def start_of(components_of: Callable[[tuple[str, ...]], DictConfig], device: torch.device) -> Gaussians:
-    """Return the Gaussians that a run has started from, built again from its settings."""
-    source = components_of(("initializer",))
-    require_whole("seed", source.seed, low=0)
-    initializer: Initializer = component(source.initializer, Initializer, "initializer")
-    return rebuild_start(source.prompt, initializer, source.seed, device)
 
 
 def trusting(call: Call) -> str:

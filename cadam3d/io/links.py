@@ -1,7 +1,18 @@
 """Links: a name that leads to a folder beside it, such as the newest run's folder."""
 
+import logging
 import os
 from pathlib import Path
+
+from cadam3d.core.console import say
+
+
+def link(name: Path, folder: Path) -> None:
+    """Make ``name`` a link to ``folder``. If that is not possible, print a note."""
+    try:
+        point(name, folder)
+    except OSError as error:
+        say(f"Note: {name} not updated ({error.strerror}).", logging.WARNING)
 
 
 def point(name: Path, folder: Path) -> None:

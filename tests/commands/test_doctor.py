@@ -152,20 +152,6 @@ def test_a_self_test_that_crashes_is_a_finding():
     assert finding.found == "RuntimeError: an illegal memory access"
 
 
-@needs_compiler
-def test_a_native_tracer_that_draws_something_else_is_broken(monkeypatch):
-    trace = doctor.trace_natively
-
-    def brighter(*case):
-        layers = trace(*case)
-        return replace(layers, paints=1.01 * layers.paints)
-
-    monkeypatch.setattr(doctor, "trace_natively", brighter)
-    finding = doctor.check_tracer()
-    assert finding.verdict is Verdict.BROKEN
-    assert finding.hint.endswith("use prior.tracer=torch")
-
-
 def replace_findings(monkeypatch, *findings: Finding) -> None:
     monkeypatch.setattr(doctor, "examine", lambda: iter(findings))
 
