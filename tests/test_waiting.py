@@ -94,10 +94,10 @@ def step_without_values(monkeypatch, lines: Sequence[str]) -> tuple[int, list[bo
 @pytest.mark.parametrize(
     "lines",
     [
-        *([f"guidance={name}"] for name in ("sds", "csd", "ism", "sdi", "ucm", "vfds", "gcs")),
+        *([f"guidance={name}"] for name in ("sds", "csd", "sdi", "ucm", "gcs")),
         ["guidance=ism_luciddreamer"],
         ["guidance=sdi_threestudio"],
-        *([f"densifier={name}"] for name in ("baseline", "absgrad", "none", "random", "mcmc", "cadam_open")),
+        *([f"densifier={name}"] for name in ("baseline", "absgrad", "random", "mcmc")),
         ["regularizer=[mean_scale,mean_opacity,outside_ball,alpha_entropy,sparsity,squared_variation]"],
         ["regularizer=[disparity_variation,total_variation]"],
         ["densifier=cadam_open", "densifier.invisible=skip", "regularizer=[sparsity]"],

@@ -66,12 +66,6 @@ def load_kernels(cache_dir: str | None) -> ctypes.CDLL:
     return ctypes.CDLL(str(build(cpu_library(), kernels_dir(cache_dir))))
 
 
-def instruction_set(kernels: ctypes.CDLL) -> str:
-    """Return the instruction set of the kernels: ``avx512``, ``avx2``, ``sse2``, ``neon`` or ``generic``."""
-    kernels.cadam3d_instruction_set.restype = ctypes.c_char_p
-    return kernels.cadam3d_instruction_set().decode()
-
-
 def rasterize(
     kernels: ctypes.CDLL,
     gaussians: Gaussians,

@@ -111,7 +111,7 @@ def test_the_published_gate_passes_noise_unless_its_scale_falls(case, beta2, sca
     assert passes(densifier, state) == pytest.approx(percent, abs=3), case
 
 
-@pytest.mark.parametrize(("visibility", "zero", "skip"), [(0.3, 84, 90), (0.1, 64, 91), (0.02, 29, 96)])
+@pytest.mark.parametrize(("visibility", "zero", "skip"), [(0.3, 84, 90), (0.02, 29, 96)])
 def test_the_published_gate_rejects_rarely_seen_gaussians_unless_unseen_steps_are_skipped(
     visibility, zero, skip
 ):
@@ -137,9 +137,7 @@ def test_shares_selected_without_and_with_a_drift(name, noise, signal):
 # The calibrated gate.
 
 
-@pytest.mark.parametrize(
-    ("beta1", "beta2"), [(0.9, 0.81), (0.9, 0.99), (0.9, 0.999), (0.98, 0.99), (0.98, 0.999)]
-)
+@pytest.mark.parametrize(("beta1", "beta2"), [(0.9, 0.81), (0.9, 0.999), (0.98, 0.99)])
 def test_the_share_of_isotropic_noise_that_passes_is_alpha_at_every_age(beta1, beta2):
     densifier = cadam(beta1=beta1, beta2=beta2)
     states = simulate(densifier, [1.0] * AGES[-1], looks=AGES)
@@ -152,7 +150,7 @@ def test_the_share_of_isotropic_noise_that_passes_is_alpha_at_every_age(beta1, b
 
 
 @pytest.mark.parametrize("noise", [isotropic, heavy])
-@pytest.mark.parametrize("visibility", [0.02, 0.1, 0.3, 1.0])
+@pytest.mark.parametrize("visibility", [0.02, 0.3, 1.0])
 def test_with_beta2_of_beta1_squared_noise_never_passes_more_often_than_alpha(noise, visibility):
     densifier = cadam(beta2=0.81)
     states = simulate(densifier, [1.0] * 300, noise=noise, visibility=visibility, looks=AGES)

@@ -20,7 +20,7 @@ from splats import (
     render_and_differentiate,
 )
 
-from cadam3d.rasterizer.cpu import instruction_set, rasterize
+from cadam3d.rasterizer.cpu import rasterize
 
 
 @pytest.fixture(autouse=True)
@@ -98,10 +98,13 @@ def test_missing_memory_is_an_error_that_leaves_the_kernels_usable(cpu):
 
 def test_narrower_vectors_and_groups_of_one_view_agree(kernel_build, build_with_flags):
     # One compilation for two independent laws: a single view has no groups, and shows the vectors alone.
-    has_wider_vectors = instruction_set(ctypes.CDLL(str(kernel_build))) == "avx512"
+    native = ctypes.CDLL(str(kernel_build))
+    native.cadam3d_instruction_set.restype = ctypes.c_char_p
+    has_wider_vectors = native.cadam3d_instruction_set() == b"avx512"
     vectors = ("-march=x86-64-v3",) if has_wider_vectors else ()
     kernels = ctypes.CDLL(str(build_with_flags(*vectors, "-DSPLAT_RECORD_BUDGET=1")))
-    assert instruction_set(kernels) != "avx512"
+    kernels.cadam3d_instruction_set.restype = ctypes.c_char_p
+    assert kernels.cadam3d_instruction_set() != b"avx512"
     for views in (1, 3):
         for absgrad in (False, True):
             scene = make_gaussians(150, degree=1), make_cameras(views, 40, 50)
