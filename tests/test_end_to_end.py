@@ -153,7 +153,7 @@ def test_a_run_starts_without_slow_imports(finished):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_saves_everything_and_prints_how_to_continue(finished, tmp_path, number, type_in):
+def test_a_signal_saves_everything_and_prints_how_to_continue(tmp_path, number):
     run_folder = tmp_path / "run"
     process = start(tmp_path, "train", *BARE, f"hydra.run.dir={run_folder}", "callback.checkpoint.every=5")
     wait_for(run_folder / "checkpoints" / "step_0000005.pt", process)
@@ -166,12 +166,6 @@ def test_a_signal_saves_everything_and_prints_how_to_continue(finished, tmp_path
     assert 5 <= summary["steps"] < 40
     assert len(read_ply(run_folder / "asset.ply")) == summary["num_gaussians"]
     assert f"cadam3d train resume={run_folder.name}" in out
-
-    if number == signal.SIGTERM:
-        return  # resuming is tested once
-    type_in(tmp_path, "train", f"resume={run_folder}")
-    whole = finished / "outputs" / "latest"
-    assert (run_folder / "asset.ply").read_bytes() == (whole / "asset.ply").read_bytes()
 
 
 @pytest.mark.parametrize(("guidance", "densifier"), [("ism", "none"), ("gcs", "mcmc")])
