@@ -167,12 +167,6 @@ def test_the_page_of_a_variant_lists_what_it_changes():
     assert "prior.compile=false" in text
 
 
-def test_the_name_of_a_group_lists_its_options():
-    text = page("background")
-    assert all(f" {name} " in text for name in LIBRARY.options["background"])
-    assert "camera:" not in text
-
-
 @pytest.mark.parametrize("columns", [40, 72, 200])
 def test_lines_fit_into_the_terminal(columns, monkeypatch):
     monkeypatch.setenv("COLUMNS", str(columns))

@@ -1,5 +1,6 @@
 """What can be chosen is read from the YAML files, without composing them."""
 
+from functools import cache
 from typing import Any
 
 import pytest
@@ -30,11 +31,23 @@ def contained(part: Any, whole: Any) -> bool:
     return part == whole or "${" in str(part)
 
 
+@cache
+def together(number: int) -> Any:
+    """Compose option ``number`` of every group at once, which takes less time than one by one."""
+    groups = {group for group, _ in OPTIONS if "/" not in group}
+    names = {group: option_names(group) for group in sorted(groups)}
+    chosen = [f"{group}={each[number % len(each)]}" for group, each in names.items()]
+    return OmegaConf.to_container(compose(["prompt=a", *chosen]))
+
+
 @pytest.mark.parametrize(("group", "name"), OPTIONS)
 def test_an_option_is_read_as_hydra_composes_it(group, name):
     kind, _, inner = group.partition("/")
-    cfg = compose(["prompt=a", *([f"{kind}=shap_e"] if inner else []), f"{group}={name}"])
-    assert contained(read_option(group, name), OmegaConf.to_container(cfg))
+    values = read_option(group, name)
+    if inner or not contained(values, together(option_names(group).index(name))):
+        # Another option of the round has changed the same setting.
+        cfg = compose(["prompt=a", *([f"{kind}=shap_e"] if inner else []), f"{group}={name}"])
+        assert contained(values, OmegaConf.to_container(cfg))
 
 
 def test_the_class_of_an_option_is_the_one_that_it_builds():

