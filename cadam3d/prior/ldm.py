@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cadam3d.core.checks import require
+from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.io.pretrained import (
     LIBRARIES,
@@ -142,19 +142,14 @@ class SingleFile(LatentDiffusion):
 
         config, key = self.config("text_encoder"), f"{self.source.key}.tokenizer"
         length, pieces = config["max_position_embeddings"], config["vocab_size"]
-        loaded: Any = None
         with suppress(OSError, ValueError):
             loaded = CLIPTokenizer.from_pretrained(self.tokenizer, model_max_length=length)
-        # If the files are missing, transformers may silently make a tokenizer that knows no word.
-        require(
-            loaded is not None and len(loaded) == pieces,
-            key,
-            expected=f"a folder or name on the hub with the {pieces} pieces of CLIP's vocabulary",
-            got=self.tokenizer,
-            example=f"{key}=DIR",
-        )
-        loaded.pad_token_id = 0
-        return loaded
+            # If the files are missing, transformers may silently make a tokenizer that knows no word.
+            if len(loaded) == pieces:
+                loaded.pad_token_id = 0
+                return loaded
+        expected = f"a folder or name on the hub with the {pieces} pieces of CLIP's vocabulary"
+        raise fail(key, expected=expected, got=self.tokenizer, example=f"{key}=DIR")
 
 
 def with_ldm_unet(found: Pretrained) -> Pretrained:
