@@ -119,7 +119,7 @@ def test_pictures_may_be_transparent_and_of_any_cameras(ball):
     ("settings", "message"),
     [
         ({"size": 0}, "exporter.images.size: expected"),
-        ({"kind": "rbg"}, "exporter.images.kinds: expected one or more of"),
+        ({"kind": "rbg"}, "exporter.images.kinds: expected one of"),
         ({"background": "red"}, "exporter.images.background: expected three numbers"),
         (
             {"cameras": make_cameras(1, 4, 4), "views": 3},
