@@ -82,7 +82,8 @@ def compose(
         is_folder = Path(search_path).is_dir()
         require(is_folder, "--config-dir", expected="a folder", got=search_path, example="--config-dir=.")
         typed = [word for word in words if word.startswith(f"{SEARCH_PATH}=")]
-        more = [path for word in typed for path in OverridesParser.create().parse_override(word).value()]
+        values: list[Any] = [OverridesParser.create().parse_override(word).value() for word in typed]
+        more = [path for value in values for path in value]
         places = ",".join(map(quote, [f"file://{Path(search_path).absolute()}", *more]))
         words = [*(word for word in words if word not in typed), f"{SEARCH_PATH}=[{places}]"]
     try:

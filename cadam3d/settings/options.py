@@ -175,14 +175,16 @@ def _read(group: str, name: str, folders: Sequence[Path]) -> tuple[list[str], di
     if not isinstance(content, dict):
         raise UserError(f"{path}: expected keys with values, got other data. Try: {option_word(group)}")
     place = package_of(group, path)
-    merged = []
+    merged: list[Any] = []
     for base in content.pop("defaults", ()):
         if isinstance(base, str) and base != "_self_":
             file, _, below = base.partition("@")
             other, _, option = file.rpartition("/")
             _, values = _read(other.lstrip("/") or group, option, folders)
             merged.append(values if below in ("", "_here_") else {below: values})
-    return place, OmegaConf.to_container(OmegaConf.merge(*merged, content)) if merged else content
+    # Hydra merges in the same way.
+    values: Any = OmegaConf.to_container(OmegaConf.merge(*merged, content))
+    return place, values
 
 
 def _places(key: str) -> Iterator[dict[str, Any]]:
