@@ -291,24 +291,27 @@ def parts_of(count: int, faces: Int[np.ndarray, "f corners"]) -> Int[np.ndarray,
 
 def areas(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f"]:
     """Return the area of each triangle."""
-    from trimesh import triangles  # slow to import
-
-    return triangles.area(vertices[faces])
+    return np.linalg.norm(_crosses(vertices, faces), axis=1) / 2
 
 
 def vertex_normals(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "v 3"]:
     """Return the directions of the sums of the triangles' normals around each vertex, weighted by area."""
-    from trimesh import geometry, triangles  # slow to import
-
-    cross = triangles.cross(vertices[faces])
-    # Trimesh takes what is much shorter than 1 for zero.
-    cross /= np.abs(cross).max(initial=1e-300)
-    normals = geometry.mean_vertex_normals(len(vertices), faces, cross)
+    cross = _crosses(vertices, faces)
+    corners, count = faces.reshape(-1), len(vertices)
+    summed = [
+        np.bincount(corners, weights=np.repeat(cross[:, axis], 3), minlength=count) for axis in range(3)
+    ]
+    normals = np.stack(summed, axis=1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
     # The triangles around a vertex may cancel each other. Any direction is right there.
-    has_direction = np.linalg.norm(normals, axis=1, keepdims=True) > 0.5
-    return np.where(has_direction, normals, [0.0, 0.0, 1.0])
+    return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+
+
+def _crosses(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return np.cross(b - a, c - a)
 
 
 @dataclass(frozen=True)
