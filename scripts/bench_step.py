@@ -67,7 +67,7 @@ def read_arguments(words: list[str] | None) -> argparse.Namespace:
     parser = measuring.parser_of(__doc__)
     parser.add_argument("--priors", nargs="+", choices=list(PRIORS), help="default: all, random on CUDA only")
     parser.add_argument("--device", default="cpu", help="cpu (default), cuda or auto")
-    number = {"type": measuring.positive}
+    number: dict[str, Any] = {"type": measuring.positive}
     parser.add_argument("--steps", **number, default=40, help="steps of each of the first two passes")
     parser.add_argument("--warmup", **number, default=5, help="steps before them that are not timed")
     parser.add_argument("--threads", **number, default=1, help="threads of torch (default: 1)")

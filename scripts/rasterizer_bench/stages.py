@@ -201,7 +201,8 @@ def time_cpu_stages(rasterizer: Rasterizer, scene: Scene, repeats: int) -> Scene
         scene.backward((output.rgb, output.alpha, output.depth))
         wall = 1e3 * (now(device) - begin)
         # The node of the graph is the context of ``rasterizer/native.py``, which holds the pass.
-        run = output.rgb.grad_fn.kernels
+        node: Any = output.rgb.grad_fn
+        run = node.kernels
         seconds, counts = (ctypes.c_double * len(CPU_STAGES))(), (ctypes.c_int64 * 3)()
         run.kernels.cadam3d_measure(run.handle, seconds, counts)
         stages = {stage: 1e3 * each for stage, each in zip(CPU_STAGES, seconds, strict=True)}
