@@ -204,7 +204,7 @@ def trained(tmp_path_factory):
     """A Stable Diffusion of a few steps, as the command writes it."""
     folder = tmp_path_factory.mktemp("model")
     line = f"--format stable_diffusion --out {folder} --groups 4 --size {SIZE} --processes 1"
-    train_prior.main(f"{line} --autoencoder-steps 8 --steps 8".split())
+    train_prior.main(f"{line} --autoencoder-steps 2 --steps 2".split())
     return folder
 
 
@@ -256,7 +256,7 @@ def test_the_command_writes_a_model_that_a_prior_reads(trained):
 
 @pytest.mark.slow
 def test_an_mvdream_continues_from_it(trained, tmp_path):
-    line = f"--format mvdream --out {tmp_path / 'mv'} --start {trained} --processes 1 --steps 8"
+    line = f"--format mvdream --out {tmp_path / 'mv'} --start {trained} --processes 1 --steps 2"
     train_prior.main(line.split())
     index = json.loads((tmp_path / "mv" / "model_index.json").read_text())
     assert index["_class_name"] == "MVDreamPipeline"
