@@ -33,7 +33,6 @@ from rasterizer_bench.check import check, check_long_sort
 from rasterizer_bench.scenes import make_scene, make_shell
 from rasterizer_bench.stages import time_cpu_stages, time_stages
 from rasterizer_bench.timing import OUT_OF_MEMORY, take_turns
-from rasterizer_bench.yardstick import Gsplat
 
 from cadam3d.build import component
 from cadam3d.core.errors import UserError
@@ -70,7 +69,7 @@ def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
     several = {"nargs": "+", "metavar": "N", "type": measuring.positive}
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument(
-        "--backends", nargs="+", choices=[GSPLAT, *option_names("rasterizer")], help="ratios: to the first"
+        "--backends", nargs="+", choices=option_names("rasterizer"), help="ratios: to the first"
     )
     parser.add_argument("--counts", **several, help="numbers of Gaussians")
     parser.add_argument("--sizes", **several, help="sizes of the square images, in pixels")
@@ -99,14 +98,14 @@ def make_backends(names: Sequence[str], device: torch.device) -> dict[str, Raste
     """
     backends: dict[str, Rasterizer] = {}
     for name in names:
-        if name != GSPLAT:
-            backends[name] = component(OmegaConf.load(config_dir() / "rasterizer" / f"{name}.yaml"))
-            continue
-        try:
-            Gsplat().prepare(device)
-            backends[name] = Gsplat()
-        except Exception as error:  # a library that does not build may raise anything
-            print(f"gsplat is skipped: {error}", flush=True)
+        rasterizer: Rasterizer = component(OmegaConf.load(config_dir() / "rasterizer" / f"{name}.yaml"))
+        if name == GSPLAT:
+            try:
+                rasterizer.prepare(device)
+            except UserError as error:
+                print(f"gsplat is skipped: {error}", flush=True)
+                continue
+        backends[name] = rasterizer
     if not backends:
         raise UserError("no backend is left. Try: --backends cuda")
     return backends

@@ -1,8 +1,8 @@
 """A stand-in for ``gsplat.rasterization`` on a CPU, made of gsplat's own pure torch functions.
 
-gsplat's projection, spherical harmonics and ``accumulate`` run anywhere. Two parts exist on CUDA only and
-are written here from its documentation: the radii with their opacity-aware box, and the list of (Gaussian,
-pixel) pairs that are blended. ``accumulate`` needs two small functions of ``nerfacc``,
+gsplat's projection, spherical harmonics and ``accumulate`` run anywhere. Three parts exist on CUDA only and
+are written here from its documentation: the radii with their opacity-aware box, the list of (Gaussian, pixel)
+pairs that are blended, and the absolute gradients. ``accumulate`` needs two small functions of ``nerfacc``,
 which are written here too.
 
 Like the kernels, the stand-in leaves garbage in the rows of Gaussians that a view does not see.
@@ -34,7 +34,7 @@ KNOWN |= {
     "backgrounds",
     "render_mode",
 }
-KNOWN |= {"rasterize_mode"}
+KNOWN |= {"absgrad", "rasterize_mode"}
 
 
 def rasterization(*args, **kwargs) -> tuple[Tensor, Tensor, dict]:
@@ -140,6 +140,8 @@ def _blend(
     gaussians, pixels = _pairs(own, conics, opacities, depths, width, height)
     # Each pair has a centre of its own, so that its gradient can be seen alone.
     own = own[gaussians]
+    if given["absgrad"] and own.requires_grad:
+        own.register_hook(lambda grad: _add_absolutes(centres, view, rows[gaussians], grad))
     with patch.dict(sys.modules, {"nerfacc": _nerfacc()}):
         sums, alpha = parts.accumulate(
             own[None],
@@ -170,6 +172,12 @@ def _pairs(
     is_reached = (1 - alpha).cumprod(dim=1) > STOP
     pixel, rank = ((alpha > 0) & is_reached).nonzero().unbind(dim=1)
     return order[rank], pixel
+
+
+def _add_absolutes(centres: Tensor, view: int, rows: Tensor, grad: Tensor) -> None:
+    if not hasattr(centres, "absgrad"):
+        centres.absgrad = torch.zeros_like(centres)
+    centres.absgrad[view].index_add_(0, rows, grad.abs().to(centres.dtype))
 
 
 def _nerfacc() -> ModuleType:

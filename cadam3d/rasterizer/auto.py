@@ -1,6 +1,6 @@
 """The automatic choice of a rasterizer: the fastest that works on the device of the Gaussians."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -15,15 +15,16 @@ from cadam3d.core.rendering import RenderOutput
 from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.rasterizer.cpu import CpuRasterizer
 from cadam3d.rasterizer.cuda import CudaRasterizer
+from cadam3d.rasterizer.gsplat import GsplatRasterizer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
-from cadam3d.rasterizer.selftest import self_test
+from cadam3d.rasterizer.selftest import GSPLAT, OWN, Demands, self_test
 
 
 @dataclass(frozen=True, kw_only=True)
 class AutoRasterizer(Rasterizer):
     """Renders with the compiled kernels for the device of the Gaussians, or else with the reference.
 
-    The choice is made once per device and process.
+    On CUDA, gsplat comes between them. The choice is made once per device and process.
     """
 
     def render(
@@ -68,32 +69,35 @@ def choose(device: torch.device) -> Chosen:
 
 @cache
 def _choose(device: torch.device) -> Chosen:
+    reason: str | None = None
+    for rasterizer, demands in FASTEST.get(device.type, ()):
+        try:
+            backend = rasterizer.prepare(device)
+            if demands is not None:
+                require_agreement(rasterizer, device, demands)
+            return Chosen(rasterizer, replace(backend, reason=reason))
+        except UserError as error:
+            reason = reason or str(error)
     reference = ReferenceRasterizer()
-    fastest = FASTEST.get(device.type, reference)
-    try:
-        backend = fastest.prepare(device)
-        # The kernels for CPUs are tested when they are built.
-        if device.type == "cuda":
-            require_agreement(fastest, device)
-        return Chosen(fastest, backend)
-    except UserError as error:
-        return Chosen(reference, replace(reference.prepare(device), reason=str(error)))
+    return Chosen(reference, replace(reference.prepare(device), reason=reason))
 
 
-def require_agreement(rasterizer: Rasterizer, device: torch.device) -> None:
+def require_agreement(rasterizer: Rasterizer, device: torch.device, demands: Demands) -> None:
     """Raise :class:`UserError` unless the rasterizer passes the self-test on ``device``."""
     try:
-        found = self_test(rasterizer, device)
+        found = self_test(rasterizer, device, demands)
     except Exception as error:
-        # A kernel that is wrong may raise anything, also without a message.
+        # Another version of a library may raise anything, also without a message.
         found = f"{type(error).__name__}: {error}".splitlines()[0]
     if isinstance(found, str) or not found.passes:
         key, name = f"rasterizer={rasterizer.prepare(device).name}", torch.cuda.get_device_name(device)
         raise UserError(f"{key} fails its self-test on {name}: {found}. Try: cadam3d doctor")
 
 
-# The fastest rasterizer for each type of device.
-FASTEST: Mapping[str, Rasterizer] = {
-    "cpu": CpuRasterizer(cache_dir=None),
-    "cuda": CudaRasterizer(cache_dir=None),
+# For each type of device, the rasterizers with what their self-test demands, the fastest first. The kernels
+# for CPUs are tested when they are built. Our kernels for GPUs come before gsplat because they repeat their
+# bits and need no nvcc.
+FASTEST: Mapping[str, Sequence[tuple[Rasterizer, Demands | None]]] = {
+    "cpu": [(CpuRasterizer(cache_dir=None), None)],
+    "cuda": [(CudaRasterizer(cache_dir=None), OWN), (GsplatRasterizer(), GSPLAT)],
 }

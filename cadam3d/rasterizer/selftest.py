@@ -4,11 +4,13 @@ The image formation model has steps: a contribution below ``ALPHA_MIN`` is skipp
 capped, and a pixel stops at ``TRANSMITTANCE_MIN``. A number that is within rounding of a step may fall on
 either side of it, and no tolerance can cover the difference. So the scene is fixed, and none of its numbers
 is within 1e-4 of a step, which is hundreds of rounding errors. Still, the scene exercises every step.
+
+Another library may have other steps and larger rounding errors, so :class:`Demands` belongs to a rasterizer.
 """
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from random import Random
 
 import torch
@@ -27,10 +29,31 @@ HEIGHT, WIDTH = 37, 53  # pixels
 # The first seed that gives a scene without a number near a step.
 SEED = 12
 IMAGES = ("rgb", "alpha", "depth")
-# The largest accepted deviations, relative to the largest number of each tensor. Rounding in float32 causes
-# about 1e-6 in images and 2e-6 in gradients, which are sums over many pixels. One splat that is missing in
-# one tile causes more than 1e-3.
-MOST_IMAGE, MOST_GRADIENT = 2e-5, 1e-4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demands:
+    """Limits that a rasterizer must keep in the self-test.
+
+    The largest accepted deviations are relative to the largest number of each tensor. One splat that is
+    missing in one tile causes more than 1e-3.
+    """
+
+    images: float  # largest deviation of an image
+    gradients: float  # largest deviation of a gradient
+    same_bits: bool  # whether a second run must give the same bits
+    most_opacity: float = 1.0  # more opaque Gaussians of the scene are reduced to this
+
+
+# Rounding in float32 causes about 1e-6 in images and 2e-6 in gradients, which are sums over many pixels.
+OWN = Demands(images=2e-5, gradients=1e-4, same_bits=True)
+# On a GPU, torch adds with atomics, and therefore in any order.
+ATOMIC = replace(OWN, same_bits=False)
+# gsplat 1.5.3 caps alpha at 0.999, so nothing in its scene comes near our cap of 0.99. It is compiled with
+# approximate divisions and exponentials, and stores alpha instead of the transmittance, which loses digits
+# where little light is left. Modelled in IEEE float32 on a CPU, that causes 3e-6 in images and 4e-5 in
+# gradients.
+GSPLAT = Demands(images=1e-4, gradients=5e-4, same_bits=False, most_opacity=0.98)
 
 
 @dataclass(frozen=True)
@@ -43,6 +66,7 @@ class Agreement:
     images: Mapping[str, float]  # of rgb, alpha, depth, means2d and radii
     gradients: Mapping[str, float]  # of the five tensors, means2d and absgrad
     repeats: bool  # whether rendering ahead gave the same bits
+    demands: Demands = OWN
 
     @property
     def worst_image(self) -> float:
@@ -57,17 +81,17 @@ class Agreement:
     @property
     def holds(self) -> bool:
         """Return whether rounding explains all deviations."""
-        return self.worst_image <= MOST_IMAGE and self.worst_gradient <= MOST_GRADIENT
+        return self.worst_image <= self.demands.images and self.worst_gradient <= self.demands.gradients
 
     @property
     def passes(self) -> bool:
-        """Return whether the rasterizer may be used: it agrees, with the same bits on every run."""
-        return self.holds and self.repeats
+        """Return whether the rasterizer may be used."""
+        return self.holds and (self.repeats or not self.demands.same_bits)
 
     def __str__(self) -> str:
         verb = "agrees" if self.holds else "disagrees"
         bits = "same bits twice" if self.repeats else "different bits the second time"
-        deviations = f"images {self.worst_image:.0e}, gradients {self.worst_gradient:.0e}"
+        deviations = f"images {_short(self.worst_image)}, gradients {_short(self.worst_gradient)}"
         return f"{verb} with the reference: {deviations}; {bits}"
 
 
@@ -81,13 +105,13 @@ class ProbeScene:
     weights: Mapping[str, Tensor]  # one tensor per image, of the size of the image
 
 
-def self_test(rasterizer: Rasterizer, device: torch.device) -> Agreement:
+def self_test(rasterizer: Rasterizer, device: torch.device, demands: Demands = OWN) -> Agreement:
     """Compare renderings on ``device`` with one of the reference, on the CPU in float64.
 
     This takes about a tenth of a second, nearly all of it for the reference. Errors of the rasterizer are not
     caught.
     """
-    scene = make_scene()
+    scene = make_scene(demands.most_opacity)
     images, gradients = _render(rasterizer.render, scene, device, torch.float32)
     # Training renders ahead, which must give the same bits. The first time, nothing is known yet, so it may
     # do what ``render`` does.
@@ -107,11 +131,12 @@ def self_test(rasterizer: Rasterizer, device: torch.device) -> Agreement:
         images={name: _deviation(images[name], want) for name, want in want_images.items()},
         gradients={name: _deviation(gradients[name], want) for name, want in want_gradients.items()},
         repeats=repeats,
+        demands=demands,
     )
 
 
-def make_scene() -> ProbeScene:
-    """Return a scene that is the same on every machine.
+def make_scene(most_opacity: float = 1.0) -> ProbeScene:
+    """Return a scene that is the same on every machine, with opacities of at most ``most_opacity``.
 
     Python guarantees the numbers of its random generator, torch does not. The Gaussians are thin and thick,
     faint and opaque, and on the screen, across its border, beside it and behind the camera.
@@ -125,7 +150,7 @@ def make_scene() -> ProbeScene:
         means=1.1 * noise(COUNT, 3),
         log_scales=-2.6 + 1.2 * noise(COUNT, 3),
         quats=noise(COUNT, 4),
-        opacity_logits=1.0 + 5.0 * noise(COUNT),
+        opacity_logits=(1.0 + 5.0 * noise(COUNT)).clamp_max(_logit(most_opacity)),
         sh=0.8 * noise(COUNT, SH_COEFFICIENTS, 3),
     )
     azimuth, elevation = torch.tensor([20.0, 200.0]), torch.tensor([-15.0, 40.0])
@@ -168,6 +193,10 @@ def _render(
     return _on_cpu(shown), _on_cpu(gradients)
 
 
+def _logit(opacity: float) -> float:
+    return math.log(opacity / (1 - opacity)) if opacity < 1 else math.inf
+
+
 def _on_cpu(tensors: Mapping[str, Tensor | None]) -> dict[str, Tensor]:
     # A missing gradient counts as a gradient of NaN.
     missing = torch.tensor(math.nan)
@@ -179,3 +208,7 @@ def _deviation(got: Tensor, want: Tensor) -> float:
     if got.shape != want.shape or not got.isfinite().all():
         return math.inf
     return float((got - want).abs().max() / want.abs().max())
+
+
+def _short(number: float) -> str:
+    return f"{number:.0e}".replace("e-0", "e-").replace("e+0", "e+")

@@ -63,12 +63,13 @@ def gsplat() -> dict[str, Any]:
     """Compile or load gsplat, and compare it with the reference."""
     import torch
     from rasterizer_bench.check import check
-    from rasterizer_bench.yardstick import Gsplat
+
+    from cadam3d.rasterizer.gsplat import GsplatRasterizer
 
     device, begin = torch.device("cuda"), time.perf_counter()
-    Gsplat().prepare(device)
+    GsplatRasterizer().prepare(device)
     seconds = time.perf_counter() - begin
-    troubles = check("gsplat", Gsplat(), device)
+    troubles = check("gsplat", GsplatRasterizer(), device)
     verdict = "; ".join(troubles) or "agrees with the reference"
     return {"says": f"{verdict}; ready in {seconds:.0f} s", "failed": bool(troubles), "is_built": True}
 

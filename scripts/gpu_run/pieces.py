@@ -29,7 +29,7 @@ TEST_MEMORY = 4 * 2**30
 MOST_PROCESSES = 6
 # Several processes that use gsplat for the first time delete the build of one another, so these tests run
 # alone, after the build.
-GSPLAT_TESTS = "tests/plugins/test_gsplat.py"
+GSPLAT_TESTS = ("tests/rasterizer/test_gsplat.py", "tests/plugins/test_gsplat.py")
 
 
 @dataclass(frozen=True)
@@ -75,13 +75,14 @@ def plan(part: str, folder: Path, found: Mapping[str, object], memory_bytes: int
 def checks(folder: Path, found: Mapping[str, object], processes: int) -> list[Piece]:
     """Return the checks, gates first. If one of the gates fails, nothing is timed."""
     parallel = ("-n", str(processes)) if processes > 1 else ()
+    ignored = tuple(f"--ignore={path}" for path in GSPLAT_TESTS)
     run = datetime.now().strftime("demo-%Y%m%d-%H%M%S")
     demo = ["prompt=a red and yellow checkered torus", "steps=100", "device=cuda"]
     demo += [] if "imageio-ffmpeg" in found else ["callback=[progress]", "exporter=[ply]"]
     sanitizer = str(found.get("compute-sanitizer"))
     return [
         Piece("self-test", own("self-test"), 120.0, is_gate=True),
-        gpu_tests("tests", *parallel, "tests/rasterizer", seconds=240.0, is_gate=True),
+        gpu_tests("tests", *ignored, *parallel, "tests/rasterizer", seconds=240.0, is_gate=True),
         Piece(
             "difficult scenes and the long sort",
             script("bench_rasterizer", "--backends", "cuda", "--check-only"),
@@ -111,7 +112,7 @@ def checks(folder: Path, found: Mapping[str, object], processes: int) -> list[Pi
             )
             for tool, seconds in SANITIZERS.items()
         ),
-        gpu_tests("other tests", f"--ignore={GSPLAT_TESTS}", "--ignore=tests/rasterizer", seconds=120.0),
+        gpu_tests("other tests", *ignored, "--ignore=tests/rasterizer", seconds=120.0),
     ]
 
 
@@ -144,5 +145,5 @@ def explains(found: Mapping[str, object]) -> list[Piece]:
             needs=("diffusers",),
         ),
         Piece("recipes", script("bench_recipes", *recipes), 240.0, needs=("diffusers",)),
-        gpu_tests("tests of gsplat", GSPLAT_TESTS, seconds=120.0),
+        gpu_tests("tests of gsplat", *GSPLAT_TESTS, seconds=120.0),
     ]

@@ -12,7 +12,7 @@ from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.rasterizer.cuda_sort import sort, sort_bytes
 from cadam3d.rasterizer.driver import Launch, Launcher
 from cadam3d.rasterizer.reference import ReferenceRasterizer
-from cadam3d.rasterizer.selftest import self_test
+from cadam3d.rasterizer.selftest import GSPLAT, OWN, self_test
 
 # Backends that promise the same bits on every run.
 PROMISE_BITS = ("cpu", "cuda")
@@ -30,11 +30,12 @@ MOST_IMAGE, MOST_GRADIENT, MOST_OUTLIERS = 1e-4, 2e-3, 0.03
 
 def check(name: str, rasterizer: Rasterizer, device: torch.device) -> list[str]:
     """Return one sentence for each problem of the backend."""
-    # gsplat caps alpha at another value, so the only scene for it has no alpha near the cap.
-    if name == "gsplat":
-        return differences(rasterizer, small_scene(make_shell(SPLATS, 3, device)))
-    agreement = self_test(rasterizer, device)
+    is_gsplat = name == "gsplat"
+    agreement = self_test(rasterizer, device, GSPLAT if is_gsplat else OWN)
     troubles = [] if agreement.holds else [f"self-test: {agreement}"]
+    # gsplat caps alpha at another value, so the only other scene for it has no alpha near the cap.
+    if is_gsplat:
+        return troubles + differences(rasterizer, small_scene(make_shell(SPLATS, 3, device)))
     for kind, gaussians in difficult_scenes(device):
         troubles += [
             f"{kind}: {difference}" for difference in differences(rasterizer, small_scene(gaussians))

@@ -11,11 +11,11 @@ import torch
 from cadam3d.commands import doctor
 from cadam3d.commands.doctor import Finding, Verdict, attempt
 from cadam3d.compiled import library
-from cadam3d.rasterizer import auto, nvrtc
+from cadam3d.rasterizer import auto, gsplat, nvrtc
 from cadam3d.rasterizer.base import Backend, Rasterizer
 from cadam3d.rasterizer.cpu import load_kernels
 from cadam3d.rasterizer.reference import ReferenceRasterizer
-from cadam3d.rasterizer.selftest import self_test
+from cadam3d.rasterizer.selftest import ATOMIC, GSPLAT, OWN, self_test
 from cadam3d.settings.options import option_names
 
 needs_compiler = pytest.mark.skipif(library.find_compiler() is None, reason="no C++ compiler")
@@ -102,14 +102,17 @@ def test_with_nothing_installed_the_reference_is_tested_and_the_rest_is_named_as
     assert doctor.check_compilers().verdict is Verdict.NOTE
 
 
-def test_the_kernels_of_a_gpu_are_tested(bare, monkeypatch, agreement):
+def test_a_gpu_without_gsplat_gets_the_command_that_installs_it(bare, monkeypatch, agreement):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(doctor.CudaRasterizer, "prepare", lambda self, device: Backend("cuda"))
     monkeypatch.setattr(doctor.AutoRasterizer, "prepare", lambda self, device: Backend("cuda"))
+    monkeypatch.setattr(gsplat, "find_spec", lambda name: None)
     monkeypatch.setattr(doctor, "self_test", lambda *_: agreement)
     found = {finding.topic: finding for finding in doctor.check_rasterizers()}
     assert found["rasterizer=cuda"].found == f"{agreement}, on cuda:0"
+    assert found["rasterizer=gsplat"].verdict is Verdict.NOTE
+    assert found["rasterizer=gsplat"].found.endswith("Try: pip install '.[gsplat]'")
 
 
 class Prepared(ReferenceRasterizer):
@@ -121,20 +124,22 @@ class Prepared(ReferenceRasterizer):
 
 
 @pytest.mark.parametrize(
-    ("topic", "device", "change", "verdict"),
+    ("topic", "demands", "change", "verdict"),
     [
-        ("rasterizer=cpu", "cpu", {"gradients": {"means": 0.1}}, Verdict.BROKEN),
-        ("rasterizer=cpu", "cpu", {"images": {"rgb": math.inf}}, Verdict.BROKEN),
-        ("rasterizer=cpu", "cpu", {"repeats": False}, Verdict.BROKEN),
+        ("rasterizer=cpu", OWN, {"gradients": {"means": 0.1}}, Verdict.BROKEN),
+        ("rasterizer=cpu", OWN, {"images": {"rgb": math.inf}}, Verdict.BROKEN),
+        ("rasterizer=cpu", OWN, {"repeats": False}, Verdict.BROKEN),
         # Without its self-test, auto chooses another backend.
-        ("rasterizer=cuda", "cuda", {"repeats": False}, Verdict.NOTE),
+        ("rasterizer=cuda", OWN, {"repeats": False}, Verdict.NOTE),
+        ("rasterizer=gsplat", GSPLAT, {"repeats": False}, Verdict.OK),
+        ("rasterizer=gsplat", GSPLAT, {"gradients": {"means": 0.1}}, Verdict.NOTE),
         # On a GPU, the sums of the reference use atomics.
-        ("rasterizer=reference", "cuda", {"repeats": False}, Verdict.OK),
+        ("rasterizer=reference", ATOMIC, {"repeats": False}, Verdict.OK),
     ],
 )
-def test_a_failed_self_test_is_reported(topic, device, change, verdict, monkeypatch, agreement):
-    monkeypatch.setattr(doctor, "self_test", lambda *_: replace(agreement, **change))
-    finding = doctor.check_rasterizer(topic, Prepared(), torch.device(device))
+def test_a_failed_self_test_is_reported(topic, demands, change, verdict, monkeypatch, agreement):
+    monkeypatch.setattr(doctor, "self_test", lambda *_: replace(agreement, demands=demands, **change))
+    finding = doctor.check_rasterizer(topic, Prepared(), torch.device("cpu"), demands)
     assert finding.verdict is verdict
     assert ("report" in finding.hint) is (verdict is not Verdict.OK)
 
@@ -146,7 +151,7 @@ def test_a_self_test_that_crashes_is_a_finding():
 
     finding = attempt(
         "rasterizer=cuda",
-        lambda: doctor.check_rasterizer("rasterizer=cuda", Crashing(), torch.device("cpu")),
+        lambda: doctor.check_rasterizer("rasterizer=cuda", Crashing(), torch.device("cpu"), OWN),
     )
     assert finding.verdict is Verdict.BROKEN
     assert finding.found == "RuntimeError: an illegal memory access"

@@ -15,7 +15,14 @@ from cadam3d.rasterizer.cpu import CpuRasterizer
 from cadam3d.rasterizer.cuda import rasterize_ahead
 from cadam3d.rasterizer.forecast import find_forecast
 from cadam3d.rasterizer.reference import ReferenceRasterizer
-from cadam3d.rasterizer.selftest import HEIGHT, MOST_GRADIENT, MOST_IMAGE, WIDTH, make_scene, self_test
+from cadam3d.rasterizer.selftest import (
+    GSPLAT,
+    HEIGHT,
+    OWN,
+    WIDTH,
+    make_scene,
+    self_test,
+)
 
 CPU = torch.device("cpu")
 
@@ -57,8 +64,8 @@ def test_float32_agrees_with_float64_far_inside_the_limits():
     agreement = self_test(ReferenceRasterizer(), CPU)
     assert agreement.holds
     assert agreement.repeats
-    assert agreement.worst_image < MOST_IMAGE / 5
-    assert agreement.worst_gradient < MOST_GRADIENT / 20
+    assert agreement.worst_image < OWN.images / 5
+    assert agreement.worst_gradient < OWN.gradients / 20
     assert set(agreement.gradients) == {*FIELDS, "means2d", "absgrad"}
 
 
@@ -101,8 +108,9 @@ def test_rendering_ahead_with_other_bits_is_noticed():
 # -------------------------------------------------------------------------- the scene
 
 
-def test_no_number_of_the_scene_is_near_a_step():
-    scene = make_scene()
+@pytest.mark.parametrize("demands", [OWN, GSPLAT])
+def test_no_number_of_the_scene_is_near_a_step(demands):
+    scene = make_scene(demands.most_opacity)
     assert not undecided(scene.gaussians, scene.cameras, within=1e-4).any()
 
 
@@ -146,7 +154,7 @@ def test_a_gradient_that_is_a_thousandth_too_large_is_noticed(field):
     agreement = self_test(bent_gradient(field, lambda grad: grad * 1.001), CPU)
     assert not agreement.holds
     assert agreement.gradients[field] == pytest.approx(1e-3, rel=0.01)
-    assert agreement.worst_image <= MOST_IMAGE
+    assert agreement.worst_image <= OWN.images
 
 
 @pytest.mark.parametrize("bend", [lambda grad: grad * math.nan, lambda grad: grad / 0, torch.zeros_like])
@@ -186,6 +194,16 @@ def test_a_wrong_image_is_noticed(after):
     assert not self_test(Bent(after=after), CPU).holds
 
 
+def test_the_scene_for_gsplat_comes_near_no_cap_and_still_stops_pixels():
+    scene = make_scene(GSPLAT.most_opacity)
+    assert scene.gaussians.opacities.max() == pytest.approx(0.98)
+    output = ReferenceRasterizer().render(scene.gaussians, scene.cameras, scene.background)
+    assert output.alpha.max() > 0.999
+    capped = replace(scene.gaussians, opacity_logits=make_scene().gaussians.opacity_logits)
+    other = ReferenceRasterizer().render(capped, scene.cameras, scene.background)
+    assert (output.alpha - other.alpha).abs().max() > 1e-3
+
+
 def test_bits_that_differ_from_run_to_run_are_noticed():
     runs = []
 
@@ -197,4 +215,5 @@ def test_bits_that_differ_from_run_to_run_are_noticed():
     assert agreement.holds
     assert not agreement.repeats
     assert not agreement.passes
+    assert replace(agreement, demands=GSPLAT).passes
     assert str(agreement).endswith("; different bits the second time")
