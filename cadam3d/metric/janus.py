@@ -1,24 +1,36 @@
 """Janus: how many fronts an asset has. Text-to-3D often shows the same face from several sides.
 
-Each view of the asset looks like some view of the true object. If the asset has one front, its views show
-every side of the object as often as the object itself does. If it has two, one side is seen twice and another
-one never. Only what differs between the views of the true object says from where it is seen. Pictures are
-therefore projected onto the space of these differences, which removes blur and noise. Brightness is left out,
-because light makes a difference between the sides of a ball.
+There are two ways to find out. Their numbers have different meanings and must not be compared.
+
+**By the truth.** Each view of the asset looks like some view of the true object. If the asset has one front,
+its views show every side of the object as often as the object itself does. If it has two, one side is seen
+twice and another one never. Only what differs between the views of the true object says from where it is
+seen. Pictures are therefore projected onto the space of these differences, which removes blur and noise.
+Brightness is left out, because light makes a difference between the sides of a ball.
+
+**By a model.** A CLIP model says for each view whether it is a front, a side or a back view of the prompt,
+and the asset has as many fronts as there are separate maxima of "front" over the azimuth.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
+from cadam3d.core.checks import require_choice, require_range, require_whole
 from cadam3d.core.number import Number
-from cadam3d.metric.base import Measurand, Measurement, Metric
+from cadam3d.metric.base import Measurand, Measurement
+from cadam3d.metric.clip import ClipMetric, load_clip
+from cadam3d.metric.scoring import Scorer
 
+WAYS = ("auto", "truth", "model")
+
+# By the truth.
 VIEWS = 24
 SIZE = 48  # pixels
 ELEVATION_DEG = 15.0
@@ -38,32 +50,116 @@ LEAST_NOISE = 0.03
 # Directions with a smaller share of the largest singular value are left out of the projection.
 LEAST_DIRECTION = 1e-3
 
+# By a model.
+SIDES = ("front", "side", "back")
+# Difference between the highest and the lowest probability of a front below which no view is one.
+LEAST_CONTRAST = 0.1
+# Views with at least this probability belong to a front, on a scale from the lowest (0) to the highest (1).
+HALF = 0.5
+# A second front is at least this far from the first one, in degrees.
+APART_DEG = 120.0
+MOST_VIEWS = 360
+
 
 @dataclass(frozen=True, kw_only=True)
-class Janus(Metric):
-    """The number of fronts of an asset, compared with the true object."""
+class Janus(ClipMetric):
+    """The number of fronts of an asset, by the true object or by a model of pictures and texts."""
 
+    node: ClassVar[str] = "metric.janus"
     numbers: ClassVar[tuple[Number, ...]] = (
-        Number(name="janus", label="Janus score", digits=3, is_more_better=False, needs_truth=True),
-        Number(name="janus_fronts", label="fronts", digits=0, is_more_better=None, needs_truth=True),
+        Number(name="janus", label="Janus score", digits=3, is_more_better=False),
+        Number(name="janus_fronts", label="fronts", digits=0, is_more_better=None),
     )
+    kind: ClassVar[str] = "clip"
+
+    by: str  # auto | truth | model
+    views: int  # azimuths that the model sees
+    elevation_deg: float  # of these views, in [-90, 90]
+
+    def __post_init__(self) -> None:
+        require_choice("metric.janus.by", self.by, WAYS)
+        require_whole("metric.janus.views", self.views, low=6, high=MOST_VIEWS)
+        require_range("metric.janus.elevation_deg", self.elevation_deg, low=-90, high=90)
+
+    def prepare(self) -> None:
+        """Find the files of the model if ``by=model``. With ``by=auto``, the truth may replace it."""
+        if self.by == "model":
+            super().prepare()
+
+    def scorer(self, device: torch.device) -> Scorer:
+        """Return the model, whose scores are the logits of the texts for a picture."""
+        clip = load_clip(self.source(), device)
+        direction = cache(lambda text: clip.texts([text])[0])
+        # The same pictures are compared with several texts in a row.
+        pictures = lru_cache(maxsize=1)(clip.pictures)
+        return Scorer(
+            score=lambda images, text: clip.logit_scale * pictures(images) @ direction(text),
+            facts=clip.facts,
+            complaints=clip.complaints,
+        )
 
     def measure(self, measurand: Measurand) -> Measurement:
         """Return ``janus`` and ``janus_fronts``; nothing if there is no truth or no Gaussian.
 
-        ``janus`` is the share of the views that show a side which other views show already: 0 for the true
-        object, and nearly 1 - 1/k for k equal fronts. ``janus_fronts`` is how often the asset shows the
-        quarter turn that it shows most, compared with the true object. The turn of the asset does not matter.
-        An object without a front, such as one that looks the same from all sides, has no number, and the
-        record says so.
+        By the truth, ``janus`` is the share of the views that show a side which other views show already: 0
+        for the true object, and nearly 1 - 1/k for k equal fronts. ``janus_fronts`` is how often the asset
+        shows the quarter turn that it shows most, compared with the true object. By a model, ``janus`` is the
+        height of the second front, from 0 (there is none) to 1 (it is as clear as the first), and
+        ``janus_fronts`` is the number of fronts. The turn of the asset does not matter. An object without a
+        front, such as one that looks the same from all sides, has no number, and the record says so.
         """
-        if len(measurand.gaussians) == 0 or measurand.truth is None:
+        if len(measurand.gaussians) == 0 or (self.by == "truth" and measurand.truth is None):
             return Measurement({})
+        if self.by == "model" or measurand.truth is None:
+            return self._by_model(measurand)
         asset = _features(lambda cameras, background: measurand.render(cameras, background).rgb[None])[0]
         modes = _features(measurand.truth.images)
         # The mode of which each view of the asset resembles some view most.
         nearest = [torch.cdist(asset, mode).square().min(dim=1).values.mean() for mode in modes]
         return _by_truth(asset, modes[int(torch.stack(nearest).argmin())])
+
+    def _by_model(self, measurand: Measurand) -> Measurement:
+        scorer = self.scorer(measurand.gaussians.device)
+        texts = [f"{side} view of {measurand.prompt}" for side in SIDES]
+        logits = []
+        for one in self.protocol.ring(self.views, self.elevation_deg).parts(1):
+            images = measurand.render(one, self.protocol.backgrounds(1)).rgb.detach().float().clamp(0, 1)
+            logits.append(torch.cat([self.scores(scorer, images, text) for text in texts]))
+        fronts = torch.stack(logits).softmax(dim=1)[:, 0]
+        if not fronts.isfinite().all():
+            raise self.failure("it returns NaN or infinity")
+        shown = {
+            "views": self.views,
+            "elevations_deg": [float(self.elevation_deg)],
+            "text": "SIDE view of {}",
+        }
+        record = {
+            "protocol": self.protocol.record() | shown,
+            **scorer.facts,
+            "text": texts[0],
+            # The probability that each view is a front, from azimuth 0 on.
+            "views": [round(float(each), 6) for each in fronts],
+        }
+        warnings = scorer.complaints(texts[0])
+        lowest, highest = fronts.min(), fronts.max()
+        if highest - lowest < LEAST_CONTRAST:
+            return replace(_none("the model sees no side as the front", record), warnings=warnings)
+        heights = (fronts - lowest) / (highest - lowest)
+        away = torch.arange(self.views) * (360.0 / self.views)
+        others = heights.roll(-int(heights.argmax()))[(away >= APART_DEG) & (away <= 360 - APART_DEG)]
+        is_front = heights >= HALF
+        count = (is_front & ~is_front.roll(1)).sum()
+        return replace(_measured(others.max(), count, record), warnings=warnings)
+
+
+def _none(reason: str, record: dict[str, Any]) -> Measurement:
+    """Return the record of an asset without a number."""
+    return Measurement({}, {"janus": {"value": None, "reason": reason, **record}})
+
+
+def _measured(janus: Tensor, fronts: Tensor, record: dict[str, Any]) -> Measurement:
+    numbers = {"janus": float(janus), "janus_fronts": float(fronts)}
+    return Measurement(numbers, {name: {"value": value, **record} for name, value in numbers.items()})
 
 
 def _by_truth(asset: Float[Tensor, "v p"], true: Float[Tensor, "v p"]) -> Measurement:
@@ -88,14 +184,9 @@ def _by_truth(asset: Float[Tensor, "v p"], true: Float[Tensor, "v p"]) -> Measur
         "views": {"looks_like_deg": [360.0 / VIEWS * int(best) for best in differences.argmin(dim=1)]},
     }
     if spread < LEAST_SPREAD:
-        reason = "the true object looks the same from all sides, so it has no front"
-        return Measurement({}, {"janus": {"value": None, "reason": reason, **record}})
-    fronts = (_by_quarters(shown) / _by_quarters(expected)).max().round()
-    numbers = {
-        "janus": float(0.5 * (shown - expected).abs().sum() / VIEWS),
-        "janus_fronts": float(fronts),
-    }
-    return Measurement(numbers, {name: {"value": value, **record} for name, value in numbers.items()})
+        return _none("the true object looks the same from all sides, so it has no front", record)
+    repeated = 0.5 * (shown - expected).abs().sum() / VIEWS
+    return _measured(repeated, (_by_quarters(shown) / _by_quarters(expected)).max().round(), record)
 
 
 def _by_quarters(counts: Float[Tensor, "v"]) -> Float[Tensor, "v"]:

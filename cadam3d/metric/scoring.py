@@ -68,16 +68,19 @@ class ScoreMetric(Metric):
 
     def values(self, measurand: Measurand, scorer: Scorer, text: str) -> Float[Tensor, "v"]:
         """Return the score of every view of the protocol. Raises ``UserError`` if the model fails."""
-        scores = []
-        for images in self.protocol.images(measurand.render):
-            try:
-                scores.append(scorer.score(images, text).detach().double().cpu())
-            # Models and the preparation of their inputs raise almost any exception.
-            except Exception as error:
-                if is_out_of_memory(error):
-                    raise
-                raise self.failure(short(error)) from error
-        return torch.cat(scores)
+        return torch.cat(
+            [self.scores(scorer, images, text) for images in self.protocol.images(measurand.render)]
+        )
+
+    def scores(self, scorer: Scorer, images: Float[Tensor, "v h w 3"], text: str) -> Float[Tensor, "v"]:
+        """Return the scores of some pictures. Raises ``UserError`` if the model fails."""
+        try:
+            return scorer.score(images, text).detach().double().cpu()
+        # Models and the preparation of their inputs raise almost any exception.
+        except Exception as error:
+            if is_out_of_memory(error):
+                raise
+            raise self.failure(short(error)) from error
 
     def failure(self, reason: str) -> UserError:
         """Return the error for a model that cannot score an asset."""

@@ -9,15 +9,24 @@ from composed import composed
 from protocols import output
 from splats import make_gaussians
 
-from cadam3d.build import component
+from cadam3d.build import component, components
 from cadam3d.core.cameras import turntable
 from cadam3d.core.gaussians import Gaussians, concatenate
 from cadam3d.core.rendering import Truth
-from cadam3d.metric.base import Measurand
+from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.janus import VIEWS, Janus
+from cadam3d.metric.scoring import Scorer
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
+SETTINGS = dict(components(composed("prompt=a", "metric=[janus]").metric, Metric, key="metric"))
 ONE = make_gaussians(1)
+
+
+def metric(**changes) -> Janus:
+    return replace(SETTINGS["janus"], **changes)
+
+
+# --- by the truth, on prior=shapes -----------------------------------------------------------------------
 
 
 class Ring:
@@ -59,7 +68,7 @@ def measured(ring: Ring, asset, **changes):
         return output(torch.stack(rows))
 
     measurand = Measurand(gaussians=ONE, render=render, prompt="a car", truth=Truth(ring), **changes)
-    return Janus().measure(measurand)
+    return metric().measure(measurand)
 
 
 def itself(azimuth):
@@ -134,7 +143,7 @@ def test_the_best_mode_of_an_open_prompt_counts(car):
         prompt="",
         truth=Truth(modes),
     )
-    assert Janus().measure(measurand).numbers["janus"] == 0
+    assert metric().measure(measurand).numbers["janus"] == 0
 
 
 def test_gaussians_with_two_faces_are_worse_than_with_one():
@@ -157,9 +166,112 @@ def test_gaussians_with_two_faces_are_worse_than_with_one():
 
     truth = Truth(lambda cameras, background: renderer(object_)(cameras, background).rgb[None])
     found = [
-        Janus().measure(Measurand(gaussians=each, render=renderer(each), prompt="", truth=truth)).numbers
-        for each in (turned, two_faces)
+        metric().measure(Measurand(gaussians=each, render=renderer(each), prompt="", truth=truth)).numbers
+        for each in (object_, turned, two_faces)
     ]
-    assert found[0]["janus"] < 0.01
-    assert found[1]["janus"] > 0.35
-    assert [each["janus_fronts"] for each in found] == [1, 2]
+    assert found[0]["janus"] == pytest.approx(0, abs=1e-6)
+    assert found[1]["janus"] < 0.01
+    assert found[2]["janus"] > 0.35
+    assert [each["janus_fronts"] for each in found] == [1, 1, 2]
+
+
+# --- by a model -------------------------------------------------------------------------------------------
+
+# What the stand-in takes for each side: red, green and blue pictures.
+CHANNELS = {"front": 0, "side": 1, "back": 2}
+
+
+class ByEye(Janus):
+    """The metric with a stand-in for CLIP, which reads the side off the colour of a picture."""
+
+    def scorer(self, device):
+        def score(images, text):
+            side = text.split(" view of ")[0]
+            return 10 * images[..., CHANNELS[side]].mean(dim=(1, 2))
+
+        return Scorer(score=score, facts={"model": "a stand-in"})
+
+
+def seen(*fronts_deg, heights=(), contrast=1.0, **changes):
+    """Return what the stand-in says about an asset with a front at each azimuth."""
+    heights = heights or (1.0,) * len(fronts_deg)
+
+    def render(cameras, background):
+        colors = []
+        for azimuth in cameras.azimuth_deg.tolist():
+            near = [
+                height * max(0.0, math.cos(math.radians(azimuth - front)))
+                for front, height in zip(fronts_deg, heights, strict=True)
+            ]
+            front = contrast * max(near)
+            colors.append([front, 0.5 * (1 - front), 0.5 * (1 - front)])
+        size = cameras.height
+        return output(torch.tensor(colors)[:, None, None].expand(-1, size, size, 3))
+
+    settings = {**vars(metric(by="model")), **changes}
+    measurand = Measurand(gaussians=ONE, render=render, prompt="a corgi")
+    return ByEye(**settings).measure(measurand)
+
+
+def test_a_model_sees_one_front():
+    found = seen(0)
+    assert found.numbers["janus"] < 0.01
+    assert found.numbers["janus_fronts"] == 1
+    record = found.details["janus"]
+    assert record["text"] == "front view of a corgi"
+    assert record["model"] == "a stand-in"
+    assert record["protocol"]["views"] == len(record["views"]) == 24
+
+
+def test_two_fronts_are_worse_than_one_and_three_are_counted():
+    assert seen(0, 180).numbers == {"janus": pytest.approx(1), "janus_fronts": 2}
+    assert seen(0, 120, 240).numbers == {"janus": pytest.approx(1), "janus_fronts": 3}
+
+
+def test_without_a_clear_front_there_is_no_number():
+    found = seen(0, contrast=0.01)
+    assert found.numbers == {}
+    assert found.details["janus"]["reason"] == "the model sees no side as the front"
+
+
+def test_the_sides_are_the_softmax_over_three_texts_of_a_clip_model(clip_folder):
+    from PIL import Image
+    from transformers import CLIPModel, CLIPProcessor
+
+    pictures = torch.rand(6, 32, 32, 3, generator=torch.Generator().manual_seed(0))
+
+    def render(cameras, background):
+        return output(pictures[[round(float(azimuth) % 360) // 60 for azimuth in cameras.azimuth_deg]])
+
+    measurand = Measurand(gaussians=ONE, render=render, prompt="a corgi")
+    found = metric(by="model", model=str(clip_folder), views=6).measure(measurand).details["janus"]
+    model, processor = CLIPModel.from_pretrained(clip_folder), CLIPProcessor.from_pretrained(clip_folder)
+    inputs = processor(
+        text=[f"{side} view of a corgi" for side in ("front", "side", "back")],
+        images=[Image.fromarray(each) for each in (pictures * 255).round().byte().numpy()],
+        return_tensors="pt",
+        padding=True,
+    )
+    with torch.no_grad():
+        expected = model(**inputs).logits_per_image.softmax(dim=1)[:, 0]
+    assert found["views"] == pytest.approx(expected.tolist(), abs=1e-5)
+    assert len(found["weights_sha256"]) == 64
+
+
+# --- which way --------------------------------------------------------------------------------------------
+
+
+def test_the_truth_is_preferred_to_a_model_unless_the_line_says_otherwise(car, monkeypatch):
+    asked = []
+
+    def ask(self, measurand):
+        asked.append(self.by)
+        return Measurement({})
+
+    monkeypatch.setattr(Janus, "_by_model", ask)
+    known = Measurand(gaussians=ONE, render=lambda c, b: output(car(c, b)[0]), prompt="", truth=Truth(car))
+    unknown = replace(known, truth=None)
+    for by, measurand in (("auto", unknown), ("model", known), ("auto", known)):
+        metric(by=by).measure(measurand)
+    assert asked == ["auto", "model"]
+    assert metric(by="truth").measure(unknown).numbers == {}
