@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeGuard
 
-from annotated_types import Ge, Le  # comes with pydantic
+from annotated_types import Ge, Le
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing

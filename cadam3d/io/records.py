@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from annotated_types import Ge, Le  # comes with pydantic
+from annotated_types import Ge, Le
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.number import COUNT, Number
