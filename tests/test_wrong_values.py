@@ -25,7 +25,7 @@ from cadam3d.sweep.grid import MOST_JOBS, expand, read_grid, read_line
 
 EXPORTER = {"_target_": "cadam3d.exporter.ply.PlyExporter", "up": "-y", "pad_sh": 0}
 # Values that no setting of any component has.
-NEVER: tuple[Any, ...] = (-math.inf, 10**400, "\x1b[2J", [[{}]], EXPORTER, {"_target_": "os.getcwd"})
+NEVER: tuple[Any, ...] = (-math.inf, 10**400, 1e39, "\x1b[2J", [[{}]], EXPORTER, {"_target_": "os.getcwd"})
 # Values that some settings have.
 PERHAPS: tuple[Any, ...] = (None, "abc", True, -1, 1e23, 2**62, [1, 2])
 # Folders of options that are not components of one class.
@@ -214,6 +214,11 @@ WRONG_LINES = {
     "initializer.count=1000000000000": "initializer.count: expected a whole number",
     "exporter.turntable.size=10000000": "exporter.turntable.size: expected a whole number",
     "metric.fidelity.views=1000000000000": "metric.fidelity.views: expected a whole number >= 1 and <=",
+    "guidance.weight=1e308": "guidance.weight: expected a finite number below 2^63",
+    "optimizer.means_lr=1e39": "optimizer.means_lr: expected a finite number",
+    "initializer.scale=1e39": "initializer.scale: expected a finite number",
+    "protocol.size=/dev/zero": "protocol.size: expected a whole number",
+    "protocol.views=-3": "protocol.views: expected a whole number >= 1",
 }
 
 

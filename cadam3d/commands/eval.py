@@ -37,7 +37,7 @@ def run(cfg: DictConfig, call: Call) -> None:
     if folder.is_dir():
         require_contained(folder, None if cfg.trust else trusting(call))
     # If a model is missing, this stops with one message, instead of one for every job.
-    build_metrics(cfg.metric)
+    build_metrics(cfg)
     if is_sweep(folder):
         _evaluate_sweep(cfg, call, folder)
         return
@@ -83,7 +83,7 @@ def evaluate(cfg: DictConfig, call: Call, folder: Path) -> dict[str, Any]:
     if (steps := read_summary(folder).get("steps")) is not None:
         result["steps"] = steps
     result |= measure(
-        build_metrics(cfg.metric),
+        build_metrics(cfg),
         Measurand(
             gaussians=asset.gaussians,
             render=renderer(own.rasterizer, asset.gaussians),

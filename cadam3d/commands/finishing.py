@@ -43,7 +43,7 @@ class Results:
         source: TruthSource = component(cfg.truth, TruthSource, "truth")
         return cls(
             exporters=components(cfg.exporter, Exporter, "exporter"),
-            metrics=build_metrics(cfg.metric),
+            metrics=build_metrics(cfg),
             measures_start=source.measures_start,
             truth=source.of(cfg.prompt, prior),
         )

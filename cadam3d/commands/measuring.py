@@ -6,20 +6,26 @@ from functools import partial
 from typing import Any
 
 import torch
+from omegaconf import DictConfig
 
-from cadam3d.build import components
+from cadam3d.build import component, components
 from cadam3d.commands.messages import keeping_others, note, warn
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.records import MEASUREMENTS, NUMBERS
 from cadam3d.metric.base import Measurand, Metric
+from cadam3d.metric.protocol import Protocol
 from cadam3d.metric.turn import facing
 from cadam3d.state import start_generators
 
 
-def build_metrics(group: Any) -> dict[str, Metric]:
-    """Return the chosen metrics by name. Raises ``UserError`` if something that one needs is missing."""
-    metrics: dict[str, Metric] = components(group, Metric, "metric")
+def build_metrics(cfg: DictConfig) -> dict[str, Metric]:
+    """Return the chosen metrics by name. Raises ``UserError`` if something that one needs is missing.
+
+    The protocol is checked even if no metric reads it.
+    """
+    component(cfg.protocol, Protocol, "protocol")
+    metrics: dict[str, Metric] = components(cfg.metric, Metric, "metric")
     for metric in metrics.values():
         metric.prepare()
     return metrics

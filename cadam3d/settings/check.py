@@ -39,8 +39,8 @@ from cadam3d.settings.options import (
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")
 # The groups of which several options can be chosen.
 LISTS = ("regularizer", "exporter", "callback", "metric")
-# Integers beyond this fit into no tensor.
-LARGEST_WHOLE = 2**63 - 1
+# Larger whole numbers fit into no tensor of int64. The square of any number below this is finite in float32.
+LIMIT = 2**63
 # The types of settings that are null or missing in the YAML files. The others are texts.
 OF_NULL = {
     **dict.fromkeys(("run", "runs", "answers"), str | Sequence[str]),
@@ -145,7 +145,7 @@ def _require(value: Any, declared: Any, key: str) -> None:
     if types and _is_of_type(plain, reduce(or_, types)):
         if declared is Any or _is_usable(plain):
             return
-        expected += ", below 2^63 and without control characters"
+        expected += " without control characters" if isinstance(plain, str) else " below 2^63"
     raise fail(key, expected=expected, got=_plain(value), example=example_word(key))
 
 
@@ -170,12 +170,12 @@ def _adapter(declared: Any) -> Any:
 
 
 def _is_usable(value: Any) -> bool:
-    """Return whether torch reads all integers in plain data, and a file can hold all its texts."""
+    """Return whether torch can compute with all numbers in plain data, and a file can hold all its texts."""
     if isinstance(value, dict | list):
         return all(map(_is_usable, [*value, *(value.values() if isinstance(value, dict) else ())]))
     if isinstance(value, str):
         return is_readable(value)
-    return not isinstance(value, int) or abs(value) <= LARGEST_WHOLE
+    return not isinstance(value, int | float) or abs(value) < LIMIT
 
 
 @cache
