@@ -42,16 +42,15 @@ class PreviewExporter(PictureSettings, PictureExporter):
     def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
         """Render row by row and write the sheet."""
         path = folder / self.file_name
-        columns = self.views if len(subjects) == 1 else self._columns()
+        columns = self.views
+        if len(subjects) > 1:
+            # The divisor of ``views`` with which the sheet is nearest to a square.
+            side = (self.views * len(self.elevations_deg)) ** 0.5
+            divisors = [number for number in range(1, self.views + 1) if self.views % number == 0]
+            columns = min(divisors, key=lambda number: abs(number - side))
         sheets = [self._sheet(subject, columns) for subject in subjects]
         write_png_bytes(path, side_by_side(sheets, captions_of(subjects), paper_of(self.background)))
         return [path]
-
-    def _columns(self) -> int:
-        """Return the divisor of ``views`` with which the sheet is nearest to a square."""
-        side = (self.views * len(self.elevations_deg)) ** 0.5
-        divisors = [number for number in range(1, self.views + 1) if self.views % number == 0]
-        return min(divisors, key=lambda number: abs(number - side))
 
     def _sheet(self, subject: Subject, columns: int) -> UInt8[np.ndarray, "h w 3"]:
         rows, labels = [], []

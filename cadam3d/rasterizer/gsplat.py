@@ -124,7 +124,10 @@ def rasterize(
         intrinsics = plain(cameras.intrinsics, device)
         floats = gaussians.map(lambda tensor: plain(tensor, device))
         is_drawable = _drawable(floats, intrinsics)
-        shown = floats.map(lambda tensor: _only(is_drawable, tensor))
+        # Ones are valid everywhere, and the rows that are not drawn get no gradient.
+        shown = floats.map(
+            lambda tensor: torch.where(is_drawable.view(-1, *[1] * (tensor.ndim - 1)), tensor, 1.0)
+        )
         opacities = torch.where(is_drawable, shown.opacities, 0.0)
         probe = absgrad_probe(floats.means.new_empty(len(cameras), len(gaussians), 2), absgrad)
         tap = _Tap()
@@ -177,11 +180,6 @@ def _drawable(gaussians: Gaussians, intrinsics: Float[Tensor, "v 3 3"]) -> Bool[
     for tensor in gaussians.tensors().values():
         is_drawable &= tensor.isfinite().reshape(len(gaussians), math.prod(tensor.shape[1:])).all(dim=1)
     return is_drawable
-
-
-def _only(is_drawable: Bool[Tensor, "n"], tensor: Float[Tensor, "n *c"]) -> Float[Tensor, "n *c"]:
-    """Return the tensor with ones, which are valid everywhere, in the other rows; they get no gradient."""
-    return torch.where(is_drawable.view(-1, *[1] * (tensor.ndim - 1)), tensor, 1.0)
 
 
 def _differentiable(means: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:

@@ -91,7 +91,7 @@ class Agreement:
     def __str__(self) -> str:
         verb = "agrees" if self.holds else "disagrees"
         bits = "same bits twice" if self.repeats else "different bits the second time"
-        deviations = f"images {_short(self.worst_image)}, gradients {_short(self.worst_gradient)}"
+        deviations = f"images {self.worst_image:.0e}, gradients {self.worst_gradient:.0e}"
         return f"{verb} with the reference: {deviations}; {bits}"
 
 
@@ -150,7 +150,7 @@ def make_scene(most_opacity: float = 1.0) -> ProbeScene:
         means=1.1 * noise(COUNT, 3),
         log_scales=-2.6 + 1.2 * noise(COUNT, 3),
         quats=noise(COUNT, 4),
-        opacity_logits=(1.0 + 5.0 * noise(COUNT)).clamp_max(_logit(most_opacity)),
+        opacity_logits=(1.0 + 5.0 * noise(COUNT)).clamp_max(torch.logit(torch.tensor(most_opacity))),
         sh=0.8 * noise(COUNT, SH_COEFFICIENTS, 3),
     )
     azimuth, elevation = torch.tensor([20.0, 200.0]), torch.tensor([-15.0, 40.0])
@@ -193,10 +193,6 @@ def _render(
     return _on_cpu(shown), _on_cpu(gradients)
 
 
-def _logit(opacity: float) -> float:
-    return math.log(opacity / (1 - opacity)) if opacity < 1 else math.inf
-
-
 def _on_cpu(tensors: Mapping[str, Tensor | None]) -> dict[str, Tensor]:
     # A missing gradient counts as a gradient of NaN.
     missing = torch.tensor(math.nan)
@@ -208,7 +204,3 @@ def _deviation(got: Tensor, want: Tensor) -> float:
     if got.shape != want.shape or not got.isfinite().all():
         return math.inf
     return float((got - want).abs().max() / want.abs().max())
-
-
-def _short(number: float) -> str:
-    return f"{number:.0e}".replace("e-0", "e-").replace("e+0", "e+")

@@ -83,7 +83,8 @@ def pack(gaussians: Gaussians, layers: Mapping[str, Float[Tensor, "n"]] | None =
     layers = layers or {}
     assert not set(layers) & set(BUILT_IN_LAYERS), f"{BUILT_IN_LAYERS} exist without data"
     assert all(len(values) == len(gaussians) for values in layers.values()), "one value per Gaussian"
-    arrays = {name: _array(tensor) for name, tensor in gaussians.tensors().items()}
+    tensors = gaussians.tensors()
+    arrays = {name: tensor.detach().cpu().float().numpy() for name, tensor in tensors.items()}
     visible = _visible(arrays)
     means = np.where(visible[:, None], arrays["means"], np.float32(0))
     drawn = [_Layer.of(values.detach().cpu().numpy().astype(np.float64)) for values in layers.values()]
@@ -95,10 +96,6 @@ def pack(gaussians: Gaussians, layers: Mapping[str, Float[Tensor, "n"]] | None =
         *(layer.levels.tobytes() for layer in drawn),
     ]
     return b"".join(part + bytes(-len(part) % 16) for part in parts)
-
-
-def _array(tensor: Tensor) -> Float32[np.ndarray, "..."]:
-    return tensor.detach().cpu().float().numpy()
 
 
 def _visible(arrays: Mapping[str, Float32[np.ndarray, "..."]]) -> Bool[np.ndarray, "n"]:

@@ -35,7 +35,10 @@ class Mixture:
         """Return the posterior means of the clean image and of the noise; finite for all a, b in [0, 1]."""
         a, b = per_view(a), per_view(b)
         total = (a * a * self.variance + b * b).clamp_min(VARIANCE_FLOOR)
-        mean = self._mean_of_modes(noisy, a, total)
+        mean = self.means[:, 0]
+        if self.means.shape[1] > 1:
+            shares = self.log_joint(noisy, a, total).softmax(dim=1).to(noisy.dtype)
+            mean = torch.einsum("vm,vmchw->vchw", shares, self.means)
         away = (noisy - a * mean) / total
         return mean + a * self.variance * away, b * away
 
@@ -44,9 +47,3 @@ class Mixture:
         away = noisy[:, None] - a[:, None] * self.means
         distance = (away * away / total[:, None]).sum(dim=(2, 3, 4), dtype=torch.float64)
         return self.log_weights.double() - 0.5 * distance
-
-    def _mean_of_modes(self, noisy: Tensor, a: Tensor, total: Tensor) -> Latents:
-        if self.means.shape[1] == 1:
-            return self.means[:, 0]
-        shares = self.log_joint(noisy, a, total).softmax(dim=1).to(noisy.dtype)
-        return torch.einsum("vm,vmchw->vchw", shares, self.means)
