@@ -135,9 +135,7 @@ def build(cache_dir: Path, capability: tuple[int, int]) -> Path:
             "Try: pip install nvidia-cuda-nvrtc"
         )
     architecture = choose_architecture(capability, compiler)
-    parts = [(KERNELS / name).read_text() for name in (SOURCE, *HEADERS)]
-    key = short_hash("\0".join([*parts, *OPTIONS, *definitions(), repr(compiler.version)]))
-    name = f"rasterizer-{key}-sm{architecture}"
+    name = f"rasterizer-{_key(compiler)}-sm{architecture}"
     cache_dir = own_folder(cache_dir, NAMES)
     if cached := find_intact(cache_dir, f"{name}-*.cubin"):
         return cached
@@ -194,3 +192,8 @@ def _check(library: ctypes.CDLL, status: int, log: str = "") -> None:
     if status != 0:
         reason = library.nvrtcGetErrorString(status).decode()
         raise UserError(f"rasterizer=cuda: NVRTC reports {reason}. {log}\nTry: rasterizer=reference")
+
+
+def _key(compiler: Nvrtc) -> str:
+    parts = [(KERNELS / name).read_text() for name in (SOURCE, *HEADERS)]
+    return short_hash("\0".join([*parts, *OPTIONS, *definitions(), repr(compiler.version)]))
