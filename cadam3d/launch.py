@@ -3,6 +3,7 @@
 import errno
 import gc
 import re
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from cadam3d.core.checks import fail, require
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import RUN_FOLDER, expanded
-from cadam3d.settings.advice import explain, line_of
+from cadam3d.settings.advice import explain
 from cadam3d.settings.check import require_effective, require_settings
 from cadam3d.settings.compose import Call, compose_line, run_hydra
 from cadam3d.settings.help import help_text
@@ -69,7 +70,7 @@ def prepare(command: str, words: Sequence[str]) -> tuple[DictConfig, Call]:
     """
     with explaining(command, words):
         line = read_line(command, words)
-        shell = f"in a shell: {line_of(command, words)}"
+        shell = f"in a shell: {shlex.join(['cadam3d', command, *words])}"
         if line.is_sweep or line.wants_page:
             raise fail(command, expected="a single run without a page", got=line.words, example=shell)
         cfg = _composed(line)

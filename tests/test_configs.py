@@ -348,7 +348,8 @@ def test_the_error_of_a_constructor_names_the_place_of_its_node():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"value": 1.0, "speed": 2}, "part: got an unexpected keyword argument 'speed'"),
+        ({"value": 1.0, "speed": 2}, r"part\.speed: no such setting\."),
+        ({"valu": 1.0}, r"part\.valu: no such setting\. Did you mean part\.value\? Try: part\.value=1\.0"),
         ({}, "part: missing a required argument: 'value'"),
     ],
 )

@@ -9,25 +9,20 @@ from hydra.errors import CompactHydraException, MissingConfigException, Override
 from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
-from cadam3d.core.checks import nearest
 from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import NO_NAME_COMPLAINT, compose, flatten, quote
 from cadam3d.settings.line import key_of
-from cadam3d.settings.options import default_options, option_names, unknown_option
+from cadam3d.settings.options import (
+    default_options,
+    option_names,
+    settings_page,
+    unknown_option,
+    unknown_setting,
+)
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
 # The choice of an option or of a list of options.
 CHOICE = re.compile(r"\+?[a-z]\w*=(\w+|\[[\w,]*\])")
-
-
-def line_of(command: str, words: Sequence[str]) -> str:
-    """Return ``cadam3d <command> <words>`` as it is typed into a shell."""
-    return shlex.join(["cadam3d", command, *words])
-
-
-def settings_page(command: str) -> str:
-    """Return the line that prints the settings of a command. A sweep has those of training."""
-    return f"cadam3d {'train' if command == 'sweep' else command} --cfg job"
 
 
 def explain(error: BaseException, command: str, words: Sequence[str]) -> UserError | None:
@@ -62,7 +57,8 @@ def _reworded(error: Exception, command: str, words: Sequence[str]) -> UserError
         return UserError(f"{key}: {_first_line(error)}. Try: {settings_page(command)}")
     text = str(error).strip() or str(error.__cause__ or "")
     if key := re.search(r"Could not override '([^']+)'", text):
-        return _unknown_key(key.group(1), command, words)
+        typed = [word.partition("=")[2] for word in words if key_of(word) == key[1]]
+        return unknown_setting(key[1], _known_keys(key[1], command, words), [*typed, "..."][0], command)
     if sweep := re.search(SWEEP_COMPLAINT, text, re.M):
         return _several_values(sweep.group(1), command)
     cause = error.__cause__
@@ -90,22 +86,9 @@ def _no_name(reason: str, command: str, words: Sequence[str]) -> UserError:
     return UserError(f"{reason}. Try: cadam3d {command} --help")
 
 
-def _unknown_key(key: str, command: str, words: Sequence[str]) -> UserError:
-    """Explain that a key does not exist, with the nearest one."""
-    known = _known_keys(key, command, words)
-    by_last = {name.rpartition(".")[2].lower(): name for name in known}
-    near = by_last.get(key.rpartition(".")[2].lower()) or nearest(key, known)
-    if not near or near == key:
-        return UserError(f"{key}: no such setting. Try: {settings_page(command)}")
-    value = next((word.partition("=")[2] for word in words if key_of(word) == key), "...")
-    return UserError(f"{key}: no such setting. Did you mean {near}? Try: {shlex.quote(f'{near}={value}')}")
-
-
 def _known_keys(wrong: str, command: str, words: Sequence[str]) -> list[str]:
     """Return every key of the configuration, for the chosen options if they compose."""
-    chosen = [
-        word for word in words if CHOICE.fullmatch(word) and key_of(word) not in (wrong, "grid", "prompts")
-    ]
+    chosen = [word for word in words if CHOICE.fullmatch(word) and key_of(word) != wrong]
     for choices in (chosen, []):
         with suppress(CompactHydraException, OmegaConfBaseException):
             cfg = OmegaConf.to_container(compose(choices, command), resolve=False)
@@ -119,4 +102,4 @@ def _several_values(override: str, command: str) -> UserError:
     key, _, value = override.partition("=")
     if isinstance(default_options().get(key), list) or command not in ("train", "sweep"):
         return UserError(f"{key}: a list has brackets. Try: {shlex.quote(f'{key}=[{value}]')}")
-    return UserError(f"{key}: several values make a sweep. Try: {line_of('sweep', [override])}")
+    return UserError(f"{key}: several values make a sweep. Try: cadam3d sweep {shlex.quote(override)}")

@@ -20,10 +20,9 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
 
-from cadam3d.core.checks import fail, nearest
+from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import is_readable, read_yaml
-from cadam3d.settings.advice import settings_page
 from cadam3d.settings.compose import flatten
 from cadam3d.settings.line import key_of
 from cadam3d.settings.options import (
@@ -34,6 +33,8 @@ from cadam3d.settings.options import (
     example_word,
     load_class,
     option_word,
+    settings_page,
+    unknown_setting,
 )
 
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")
@@ -90,9 +91,7 @@ def require_effective(cfg: DictConfig, command: str, overrides: Sequence[str]) -
     references = " ".join(re.findall(r"\$\{[^}]*", str(raw)))
     for name in map(str, raw):
         if name not in declared and not re.search(rf"\b{re.escape(name)}\b", references):
-            near = nearest(name, declared)
-            meant = f" Did you mean {near}?" if near else ""
-            raise UserError(f"{name}: no such setting.{meant} Try: {settings_page(command)}")
+            raise unknown_setting(name, declared, raw[name], command)
 
 
 def require_settings(values: Mapping[Any, Any]) -> None:
@@ -123,8 +122,12 @@ def require_declared(node: Any, kinds: tuple[type, ...], key: str) -> None:
     names = [name for name in map(str, node) if name != TARGET]
     try:
         signature.bind(**dict.fromkeys(names))
-    except TypeError as error:  # a key is unknown or lacks
-        raise UserError(f"{key}: {error}. Try: cadam3d train --cfg job") from error
+    except TypeError as error:
+        known = [f"{key}.{name}" for name in signature.parameters]
+        for name in names:
+            if name not in signature.parameters:
+                raise unknown_setting(f"{key}.{name}", known, raw[name]) from error
+        raise UserError(f"{key}: {error}. Try: {settings_page('train')}") from error
     for name in names:
         reference = REFERENCE.fullmatch(str(raw[name]))
         # The user changes the node to which a setting refers, such as ${prompting}.
@@ -136,7 +139,6 @@ def _require(value: Any, declared: Any, key: str) -> None:
     """Raise ``UserError`` unless ``value`` is of the declared type; the settings of an object are checked."""
     members = get_args(declared) if get_origin(declared) in (Union, UnionType) else (declared,)
     classes = tuple(each for each in members if inspect.isclass(each) and each.__module__ != "builtins")
-    classes = tuple(each for each in classes if get_origin(each) is None)
     if _is_described(value) and classes:
         require_declared(value, classes, key)
         return

@@ -2,7 +2,7 @@
 
 The comment beside a key, or directly above it, describes the key. The first comment of a file describes the
 option or the command. A key without a comment has the words of the same key in the file that its option
-builds on, or else in another option with the same class. Nothing is composed and torch is not imported.
+builds on. Nothing is composed and torch is not imported.
 """
 
 import re
@@ -120,39 +120,25 @@ class Library:
         groups = choices.keys() & self.options.keys()
         chosen = [Setting(key=key, value=spelled(value)) for key, value in choices.items() if key in groups]
         words = {
-            key: self._words_by_class.get((target, key.rpartition(".")[2]), "")
-            for key, target in _keys_by_class(values)
+            ".".join([*package_of(group, path), key]): note for key, note in self._words(group, name).items()
         }
         return Option(
             about=about_of(path),
-            base=next((base for base in bases if "/" not in base), ""),
-            settings=(*chosen, *_settings(values, words | self._words(group, name))),
+            base=next((base for base, _ in bases if "/" not in base), ""),
+            settings=(*chosen, *_settings(values, words)),
         )
 
     def _words(self, group: str, name: str) -> dict[str, str]:
-        """Return the words in the file of an option and in those that it builds on, by full key."""
+        """Return the words in the file of an option and in those that it builds on, by key in the file."""
         path = option_file(group, name, self.folders)
         words: dict[str, str] = {}
-        for base in _defaults(read_yaml(path))[0]:
+        for base, place in _defaults(read_yaml(path))[0]:
             inner, _, option = base.lstrip("/").rpartition("/")
-            words |= self._words(inner or group, option)
-        for last, note in words_in(path).items():
-            key = ".".join([*package_of(group, path), last])
+            words |= {place + key: note for key, note in self._words(inner or group, option).items()}
+        for key, note in words_in(path).items():
             meaning = words.get(key, "").removesuffix(".")
             words[key] = f"{meaning}. Here: {note}" if meaning and note not in meaning else note
         return words
-
-    @cached_property
-    def _words_by_class(self) -> dict[tuple[str, str], str]:
-        """Return the words for the settings of objects, by class and key, in all options."""
-        known: dict[tuple[str, str], str] = {}
-        for group, names in self.options.items():
-            for path in (option_file(group, name, self.folders) for name in names):
-                words = words_in(path)
-                for key, target in _keys_by_class(read_yaml(path)):
-                    if key in words:
-                        known.setdefault((target, key.rpartition(".")[2]), words[key])
-        return known
 
 
 def help_text(command: str, overrides: Sequence[str], folders: Sequence[Path]) -> str:
@@ -215,22 +201,13 @@ def words_in(path: Path) -> dict[str, str]:
     return found
 
 
-def _defaults(content: Any) -> tuple[list[str], dict[str, Any]]:
-    """Return the files and the choices of groups in the list of defaults of a file."""
+def _defaults(content: Any) -> tuple[list[tuple[str, str]], dict[str, Any]]:
+    """Return the files in the list of defaults of a file, each with its place, and the choices of groups."""
     entries = content.get("defaults", ())
-    bases = [each.partition("@")[0] for each in entries if isinstance(each, str) and each != "_self_"]
+    bases = [each.split("@") for each in entries if isinstance(each, str) and each != "_self_"]
+    places = [(base, f"{place[0]}." if place and place != ["_here_"] else "") for base, *place in bases]
     pairs = [pair for entry in entries if isinstance(entry, dict) for pair in entry.items()]
-    return bases, {key.removeprefix("override ").lstrip("/"): value for key, value in pairs}
-
-
-def _keys_by_class(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the dotted keys of all objects except schedules, each with the class of its object."""
-    target = str(values.get(TARGET, ""))
-    for name, value in values.items():
-        if target and not target.startswith(SCHEDULES):
-            yield f"{prefix}{name}", target
-        if isinstance(value, dict):
-            yield from _keys_by_class(value, f"{prefix}{name}.")
+    return places, {key.removeprefix("override ").lstrip("/"): value for key, value in pairs}
 
 
 def _settings(values: dict[str, Any], words: Mapping[str, str], prefix: str = "") -> Iterator[Setting]:

@@ -7,7 +7,7 @@ package. Nothing is composed here.
 
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from inspect import isabstract, isclass
 from pathlib import Path
@@ -55,6 +55,24 @@ def unknown_option(group: str, got: str, known: Sequence[str], command: str = "t
     near = nearest(got, known)
     example = f"{group}={near}" if near else option_word(group, command)
     return fail(group, expected=f"one of {'|'.join(known)}", got=got, example=example)
+
+
+def unknown_setting(key: str, known: Iterable[str], value: object, command: str = "train") -> UserError:
+    """Return the error for a key that does not exist, with ``value`` given to the nearest known one."""
+    names = [name for name in known if name != key]
+    parent, _, last = key.rpartition(".")
+    inside = {name.removeprefix(f"{parent}."): name for name in names if name.startswith(f"{parent}.")}
+    by_last = {name.rpartition(".")[2].lower(): name for name in names}
+    near = inside.get(nearest(last, inside)) if inside else by_last.get(key.lower()) or nearest(key, names)
+    if near:
+        word = shlex.quote(f"{near}={spelled(value)}")
+        return UserError(f"{key}: no such setting. Did you mean {near}? Try: {word}")
+    return UserError(f"{key}: no such setting. Try: {settings_page(command)}")
+
+
+def settings_page(command: str) -> str:
+    """Return the line that prints the settings of a command. A sweep has those of training."""
+    return f"cadam3d {'train' if command == 'sweep' else command} --cfg job"
 
 
 def read_option(group: str, name: str, folders: Sequence[Path] = ()) -> dict[str, Any]:

@@ -100,12 +100,11 @@ def test_an_option_inherits_the_descriptions_of_its_base(tmp_path):
     assert option.base == "base"
 
 
-def test_a_key_without_a_description_has_the_one_in_another_option_of_its_class(tmp_path):
-    one = "# One.\n_target_: a.B\nsize: 1 # pixels\ninner: # an object\n  _target_: a.C\n  size: 2 # metres\n"
-    two = "# Two.\n_target_: a.B\nsize: 3\ninner:\n  _target_: a.C\n  size: 4\n"
-    other = "# Other.\n_target_: a.D\nsize: 5 # hours\n"
-    option = library(tmp_path, thing__one=one, thing__two=two, thing__a=other).option("thing", "two")
-    assert [each.words for each in option.settings] == ["pixels", "an object", "metres"]
+def test_a_place_inside_an_option_inherits_the_descriptions_of_the_option_that_it_builds_on(tmp_path):
+    base = "# Base.\n_target_: a.B\nsize: 1 # pixels\n"
+    derived = "# It.\ndefaults: [/thing/base@inner, _self_]\n_target_: a.C\ninner:\n  size: 2\n"
+    option = library(tmp_path, thing__base=base, other__it=derived).option("other", "it")
+    assert {each.key: each.words for each in option.settings} == {"other.inner.size": "pixels"}
 
 
 def test_a_schedule_is_one_value(tmp_path):
