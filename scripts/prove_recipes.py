@@ -42,6 +42,7 @@ RECIPES = {
     "gcs_beg": Recipe("shapes_sd", replicas=20),
     "dreamgaussian": Recipe("shapes_sd"),
     "flowdreamer": Recipe("shapes_sd3", replicas=20),
+    "flowdreamer_near": Recipe("shapes_sd3", replicas=20),
     "flowdreamer_ucm": Recipe("shapes_sd3", replicas=20),
     "mvdream": Recipe("shapes_mvdream", replicas=20),
 }

@@ -1,5 +1,7 @@
 """The published numbers of each family: one factor converts all lengths, and steps are as published."""
 
+import re
+
 import pytest
 import torch
 
@@ -7,18 +9,28 @@ from cadam3d.build import component
 from cadam3d.core.schedule import as_schedule
 from cadam3d.core.sh import SH_C0
 from cadam3d.initializer.shap_e import ColoredMesh
+from cadam3d.prior.prompting import PerpNeg
 from cadam3d.settings.compose import compose
+from cadam3d.settings.options import config_dir
 
-UNITS = {"gaussiandreamer": 1.5, "lucid": 0.5, "dreamgaussian": 1.0}  # of theirs in one of ours
-EXTENT = {"gaussiandreamer": 4.0, "lucid": 3.5, "dreamgaussian": 4.0}  # theirs
-PERCENT_DENSE = {"gaussiandreamer": 0.01, "lucid": 0.003, "dreamgaussian": 0.01}
+# Theirs in one of ours.
+UNITS = {"gaussiandreamer": 1.5, "lucid": 0.5, "flowdreamer_near": 0.5, "dreamgaussian": 1.0}
+EXTENT = {"gaussiandreamer": 4.0, "lucid": 3.5, "flowdreamer_near": 2.5, "dreamgaussian": 4.0}  # theirs
+PERCENT_DENSE = {"gaussiandreamer": 0.01, "lucid": 0.003, "flowdreamer_near": 0.003, "dreamgaussian": 0.01}
 MEANS_LR = {  # step: published
     "gaussiandreamer": {0: 2e-4, 30_000: 1e-4},
     "lucid": {0: 1.6e-4 * 3.5, 5000: 1.6e-6 * 3.5},
+    "flowdreamer_near": {0: 1.6e-4 * 2.5, 5000: 1.6e-6 * 2.5},
     "dreamgaussian": {0: 1e-2, 300: 2e-4, 500: 2e-4},
 }
-DISTANCES = {"gaussiandreamer": (1.5, 4.0), "lucid": (5.2, 5.5), "dreamgaussian": (2.5, 2.5)}
-STEPS = {"gaussiandreamer": 1200, "lucid": 5000, "dreamgaussian": 500}
+DISTANCES = {  # at the first step; those of the LucidDreamer family come nearer
+    "gaussiandreamer": (1.5, 4.0),
+    "lucid": (5.2, 5.5),
+    "flowdreamer_near": (3.7, 4.0),
+    "dreamgaussian": (2.5, 2.5),
+}
+LAST_DISTANCES = {"lucid": (3.5, 5.0), "flowdreamer_near": (2.5, 3.5)}
+STEPS = {"gaussiandreamer": 1200, "lucid": 5000, "flowdreamer_near": 5000, "dreamgaussian": 500}
 CAMERAS = {"lucid": "progressive"}
 
 
@@ -36,7 +48,10 @@ def test_all_lengths_of_a_family_are_converted_by_one_factor(family):
     for step, rate in MEANS_LR[family].items():
         assert as_schedule(optimizer.means_lr)(step) * unit == pytest.approx(rate, rel=1e-4)
     distance = build("camera", CAMERAS.get(family, family)).distance
-    distance = distance.at(0) if family == "lucid" else distance
+    if family in LAST_DISTANCES:
+        nearest = [unit * end for end in distance.at(100)]
+        assert nearest == pytest.approx(LAST_DISTANCES[family], rel=1e-4)
+        distance = distance.at(0)
     assert [unit * end for end in distance] == pytest.approx(DISTANCES[family], rel=1e-4)
 
 
@@ -58,15 +73,24 @@ def test_gaussiandreamer_starts_from_the_mesh_times_its_published_factor():
     torch.testing.assert_close(made.scales[corner], nearest.square().mean().sqrt().expand(3))
 
 
-@pytest.mark.parametrize("recipe", ["luciddreamer", "flowdreamer", "flowdreamer_ucm", "gcs_beg"])
-def test_the_lucid_family_starts_from_lifted_grey_points(recipe):
+@pytest.mark.parametrize(
+    ("recipe", "lift"),
+    [
+        ("luciddreamer", 0.15),
+        ("flowdreamer", 0.15),
+        ("flowdreamer_near", 0.05),
+        ("flowdreamer_ucm", 0.15),
+        ("gcs_beg", 0.15),
+    ],
+)
+def test_the_lucid_family_starts_from_lifted_grey_points(recipe, lift):
     cfg = compose(["prompt=a red cube", f"experiment={recipe}"])
     initializer = component(cfg.initializer)
     made = shape(initializer)
     points = 0.5 * made.means.view(4096, 20, 3)  # in its units
     low, high = points.mean(dim=1).amin(dim=0), points.mean(dim=1).amax(dim=0)
     assert (high - low).tolist() == pytest.approx([1.0, 1.0, 1.0], abs=0.02)
-    assert float(low[2] + high[2]) / 2 == pytest.approx(0.15, abs=0.03)
+    assert float(low[2] + high[2]) / 2 == pytest.approx(lift, abs=0.03)
     # All offsets are within a ball of 0.05.
     assert float((points[0, :, None] - points[0]).norm(dim=-1).max()) <= 0.1
     torch.testing.assert_close(
@@ -99,6 +123,7 @@ def test_flowdreamer_has_the_lengths_of_luciddreamer():
         ("gaussiandreamer", range(400, 900, 100)),
         ("lucid", range(200, 3000, 100)),
         ("flowdreamer", range(200, 1500, 100)),
+        ("flowdreamer_near", range(200, 1500, 100)),
         ("dreamgaussian", range(50, 501, 50)),
     ],
 )
@@ -153,6 +178,13 @@ def test_flowdreamers_cameras_are_its_codes_defaults_and_its_head_can_be_typed()
     camera = component(compose(["prompt=a head", "experiment=flowdreamer", *head]).camera)
     assert [camera.azimuth_deg.at(count) for count in (0, 1, 2)] == [(-80, 80), (-120, 120), (-180, 180)]
     assert camera.elevation_deg.at(9) == (0, 45)
+
+
+def test_sdis_option_names_the_perp_neg_of_its_source():
+    text = (config_dir() / "guidance" / "sdi_threestudio.yaml").read_text()
+    words = re.findall(r"prompting[.a-z_]*=\w+", text)
+    prompting = component(compose(["prompt=a corgi", "guidance=sdi_threestudio", *words]).prompting)
+    assert prompting == PerpNeg(curve="threestudio", overhead_deg=60)
 
 
 def test_gcs_beg_clips_gradients_in_its_own_unit_of_length():

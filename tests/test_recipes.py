@@ -41,6 +41,7 @@ RECIPES = {
         "disparity": 0.2,
     },
     "flowdreamer": FLOW,
+    "flowdreamer_near": FLOW,
     "flowdreamer_ucm": FLOW,
     "gcs_beg": LUCID
     | {
@@ -78,6 +79,7 @@ RECIPES = {
 }
 PIPELINES = {
     "flowdreamer": "stable_diffusion_3",
+    "flowdreamer_near": "stable_diffusion_3",
     "flowdreamer_ucm": "stable_diffusion_3",
     "mvdream": "mvdream",
 }

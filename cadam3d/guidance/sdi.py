@@ -39,7 +39,7 @@ class SDI(GuidedDistillation):
     ``guidance=sdi_threestudio`` has: t falls from 0.98 to 0.25, tau is below 0.1, and the inversion has the
     levels that are called "rows" here. It takes x0 to be at the first row of the noise table, t = 0.001.
     Then come 0.002 and every further ``inversion_stride`` below t, and t' directly after the last of these.
-    It also differs in four points for which there is no option:
+    It also differs in five points for which there is no option:
 
     - At the first level it gives the network the timestep -99. Ours is 0.
     - It adds its noise at every step of the inversion. Over ten steps the sum in x_t' agrees with the
@@ -47,6 +47,7 @@ class SDI(GuidedDistillation):
     - It passes x_t' itself to the last prediction as if its level were t, where the paper goes back to t.
     - Without Perp-Neg it counts guidance from the prompt: its scales 7.5 and -7.5 are 8.5 and -6.5 in the
       conventional form. Its configuration uses Perp-Neg, which has the conventional form.
+    - It divides the mean over all elements by the number of views once more.
     """
 
     inversion_scale: float
