@@ -1,8 +1,8 @@
 # make demo   install into .venv and train two objects: with the exact prior, and with a small network
 # make test   ruff, pyright and the whole test suite: everything that must hold before a merge
 # make check  ruff, pyright and the tests of what has changed since the last commit on main; less than a minute
-# make gpu    check, time and explain the CUDA kernels on the NVIDIA GPU of this machine, in at most 25 minutes;
-#             PART=checks, PART=times and PART=explains do it in three parts of less than ten minutes
+# make gpu    check, time and explain the CUDA kernels on the NVIDIA GPU of this machine, in at most 35 minutes and
+#             the time of installing; PART=checks and so on (docs/notes/performance.md) do it in parts of less than ten
 # make docs   build the documentation as a site into the folder site, strictly: no warning, no broken link
 # make clean  remove .venv and caches; outputs stay
 # PYTHON=python3.12 chooses the interpreter; JOBS=2 sets the number of test processes.
@@ -43,8 +43,8 @@ gpu:
 	@$(or $(wildcard $(BIN)/python),$(PYTHON),python3) scripts/gpu.py --look
 	@$(MAKE) --no-print-directory $(BIN)/python
 	@torch="$$($(BIN)/python scripts/gpu.py --torch)"; \
-	if [ -n "$$torch" ]; then $(BIN)/python -m pip install --quiet --constraint constraints.txt "$$torch"; fi
-	@$(MAKE) --no-print-directory .venv/.installed-dev
+	if [ -n "$$torch" ]; then $(BIN)/python -m pip install --constraint constraints.txt "$$torch"; fi
+	@[ -e .venv/.installed-dev ] || $(MAKE) --no-print-directory .venv/.installed-gpu
 	$(BIN)/python scripts/gpu.py $(if $(PART),--part $(PART))
 
 docs: .venv/.installed-docs
@@ -64,11 +64,16 @@ clean:
 	$(INSTALL) ".[dev]"
 	@touch $@ .venv/.installed .venv/.installed-docs
 
+# The largest download is torch with 2 to 3 GB, so pip shows its progress.
+.venv/.installed-gpu: pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[gpu]"
+	@touch $@ .venv/.installed
+
 .venv/.installed-docs: pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) ".[docs]"
 	@touch $@
 
 $(BIN)/python:
-	@test -n "$(PYTHON)" || { echo "cadam3d needs Python 3.11, 3.12 or 3.13. Try: make $(MAKECMDGOALS) PYTHON=/path/to/python3.12"; exit 1; }
+	@test -n "$(PYTHON)" || { echo "cadam3d needs Python 3.11, 3.12 or 3.13. Try: uv python install 3.12, or conda create -p python3.12 python=3.12, and then make $(MAKECMDGOALS) PYTHON=/path/to/python3.12"; exit 1; }
 	@$(PYTHON) -c '$(SUPPORTED)' || { echo "$(PYTHON) is not Python 3.11, 3.12 or 3.13. Try: make $(MAKECMDGOALS) PYTHON=python3.12"; exit 1; }
 	@$(PYTHON) -m venv .venv || { rm -rf .venv; echo "$(PYTHON) cannot make a virtual environment. Try: apt install python3-venv"; exit 1; }

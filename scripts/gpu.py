@@ -1,11 +1,12 @@
-"""Check, time and explain the CUDA kernels on this machine's NVIDIA GPU, in at most 25 minutes.
+"""Check, time and explain the CUDA kernels on this machine's NVIDIA GPU, in at most 35 minutes.
 
-    python scripts/gpu.py                     # checks, then times, then explanations
-    python scripts/gpu.py --part checks       # one of the three parts, each less than ten minutes
+    python scripts/gpu.py                     # all parts
+    python scripts/gpu.py --part checks       # one part, less than ten minutes
 
-If a check fails, nothing is timed, and the stage of the kernels that is wrong is named. The same line
-continues where the last one stopped: what has passed is kept, unless the GPU, a package or a file of the
-project has changed. Results are in --folder: gpu.json, gpu.md, and logs. Without a GPU, one line says so.
+If the self-test or the difficult scenes fail, nothing is timed, and the stage of the kernels that is wrong is
+named. The same line continues where the last one stopped: what has passed is kept, unless the GPU, a package
+or a file of the project has changed. Results are in --folder: gpu.json, gpu.md, and logs. Without a GPU, one
+line says so.
 """
 
 import argparse
@@ -13,7 +14,10 @@ import sys
 from pathlib import Path
 
 if sys.version_info < (3, 11):  # noqa: UP036
-    sys.exit("gpu: expected Python 3.11 or newer. Try: python3.12 scripts/gpu.py")
+    sys.exit(
+        f"gpu: expected Python 3.11 or newer, got {sys.version.split()[0]}. "
+        "Try: uv python install 3.12, or conda create -p python3.12 python=3.12"
+    )
 
 from gpu_run import session
 from gpu_run.machine import REPOSITORY, TroubleError, find_device, find_packages, fitting_torch

@@ -3,7 +3,9 @@
 import ctypes
 import hashlib
 import os
+import re
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,8 +15,9 @@ from typing import Any
 
 REPOSITORY = Path(__file__).parents[2]
 DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
-# Attributes of cuDeviceGetAttribute.
-MAJOR, MINOR = 75, 76
+# Attributes of cuDeviceGetAttribute, and the compute mode in which one process has the GPU for itself.
+MAJOR, MINOR, COMPUTE_MODE = 75, 76, 20
+EXCLUSIVE_PROCESS = 3
 # Folders with tools of the CUDA toolkit that are often missing in PATH.
 TOOL_FOLDERS = ("/usr/local/cuda/bin", "/usr/local/cuda/compute-sanitizer", "/opt/cuda/bin")
 TOOLS = ("compute-sanitizer", "nvcc", "c++")
@@ -38,6 +41,7 @@ class Device:
     capability: str
     memory_bytes: int
     driver_cuda: str  # the newest CUDA version that the driver supports
+    is_exclusive: bool = False  # whether only one process at a time may use it
 
 
 def find_device(load: Callable[[str], Any] = ctypes.CDLL) -> Device:
@@ -69,6 +73,7 @@ def find_device(load: Callable[[str], Any] = ctypes.CDLL) -> Device:
         capability=f"{attribute(MAJOR)}.{attribute(MINOR)}",
         memory_bytes=memory.value,
         driver_cuda=f"{newest.value // 1000}.{newest.value % 1000 // 10}",
+        is_exclusive=attribute(COMPUTE_MODE) == EXCLUSIVE_PROCESS,
     )
 
 
@@ -82,6 +87,23 @@ def fitting_torch(driver_cuda: str) -> str:
     if major < 12:
         raise TroubleError(f"expected a driver for CUDA 12 or newer (525), got one for CUDA {driver_cuda}")
     return "torch" if major >= 13 else "torch<2.11"
+
+
+def require_nvcc(torch_cuda: str, nvcc: str | None = None) -> None:
+    """Raise :class:`TroubleError` unless nvcc has the major version of CUDA for which torch is built.
+
+    With another one, torch refuses to build an extension such as gsplat, after minutes of preparation.
+    """
+    nvcc = nvcc or find_tools().get("nvcc", "nvcc")
+    said = subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=False).stdout
+    release = re.search(r"release (\d+)\.\d+", said)
+    major = torch_cuda.partition(".")[0]
+    if release is None or release[1] != major:
+        got = release[0] if release else f"{nvcc} without a version"
+        raise TroubleError(
+            f"gsplat is not supported here: expected nvcc {major}, as torch is built for CUDA {torch_cuda}, "
+            f"got {got}"
+        )
 
 
 def find_tools() -> dict[str, str]:

@@ -65,7 +65,9 @@ def gsplat() -> dict[str, Any]:
     from rasterizer_bench.check import check
 
     from cadam3d.rasterizer.gsplat import GsplatRasterizer
+    from gpu_run.machine import require_nvcc
 
+    require_nvcc(str(torch.version.cuda))
     device, begin = torch.device("cuda"), time.perf_counter()
     GsplatRasterizer().prepare(device)
     seconds = time.perf_counter() - begin

@@ -20,7 +20,7 @@ from typing import Any
 from measuring import commit, first_line, processor, table
 
 from gpu_run.machine import REPOSITORY, Device, TroubleError, find_packages, find_tools, hash_sources
-from gpu_run.pieces import PARTS, RESULT, Piece, own, plan
+from gpu_run.pieces import PARTS, RESULT, Piece, most_processes, own, plan
 
 PASSED, FAILED, SKIPPED = "passed", "FAILED", "skipped"
 # The first import of torch from a slow disk takes long.
@@ -47,7 +47,7 @@ def run(folder: Path, device: Device, parts: list[str]) -> int:
         if part != "checks":
             require_checks(plan_of("checks", folder, device, record), record)
         if not run_part(part, pieces, folder, record):
-            print("A check has failed, so nothing is timed.")
+            print("A check has failed, so nothing else runs.")
             run_piece(part, STAGES, STAGES.seconds, folder, record)
             return 1
     return int(any(entry["status"] == FAILED for entry in record["pieces"].values()))
@@ -56,7 +56,7 @@ def run(folder: Path, device: Device, parts: list[str]) -> int:
 def plan_of(part: str, folder: Path, device: Device, record: dict[str, Any]) -> list[Piece]:
     """Return the pieces of a part on the machine of the record."""
     found = record["machine"]["packages"] | record["machine"]["tools"]
-    return plan(part, folder, found, device.memory_bytes, os.cpu_count() or 1)
+    return plan(part, folder, found, most_processes(device, os.cpu_count() or 1))
 
 
 def begin(folder: Path, device: Device) -> dict[str, Any]:
@@ -115,6 +115,8 @@ def run_piece(part: str, piece: Piece, left: float, folder: Path, record: dict[s
     missing = [name for name in piece.needs if name not in machine["packages"] | machine["tools"]]
     if missing:
         status, says, result = SKIPPED, f"not installed: {', '.join(missing)}", None
+    elif piece.after and record["pieces"].get(piece.after, {}).get("status") != PASSED:
+        status, says, result = SKIPPED, f"needs a pass of {piece.after}", None
     else:
         status, says, result = run_process(piece, min(left, piece.seconds), folder)
     print(f"  {piece.name}: {status}, {says}", flush=True)
@@ -163,7 +165,8 @@ def judge(piece: Piece, code: int | None, log: str, result: dict[str, Any] | Non
     """Return the status of a piece that has ended, and one line about it; the code is ``None`` if it hung."""
     lines = [line.strip(" =") for line in log.splitlines() if line.strip(" =")] or ["no output"]
     if code is None:
-        return FAILED, f"ended by its time limit; its last line: {lines[-1][:MOST_LETTERS]}"
+        status = SKIPPED if piece.may_be_slow else FAILED
+        return status, f"ended by its time limit; its last line: {lines[-1][:MOST_LETTERS]}"
     found = [line for line in lines if piece.expects and re.search(piece.expects, line)]
     says = (result or {}).get("says") or (found or lines)[-1]
     if code == 0 and (found or not piece.expects):
