@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 
 from cadam3d import __version__
+from cadam3d.core.console import complain, say, show
 from cadam3d.core.errors import UserError
 from cadam3d.core.openmp import waiting
 
@@ -53,10 +54,11 @@ def main() -> None:
     except UserError as error:
         if wants_traceback:
             raise
-        print(f"cadam3d: {error}", file=sys.stderr)
+        complain(str(error))
         code = 1
     except KeyboardInterrupt:
-        print("\ncadam3d: interrupted", file=sys.stderr)
+        say("")
+        complain("interrupted")
         code = 130
     except BrokenPipeError:
         # A reader such as head has closed the pipe. Python would complain when it flushes stdout at exit.
@@ -69,10 +71,10 @@ def dispatch(words: Sequence[str]) -> int:
     """Run the command line ``words``, without the program's name, and return the exit code."""
     if not words or words[0] in HELP_FLAGS:
         commands = [f"  {name:<8}{summary:<50}{example}" for name, (summary, example) in COMMANDS.items()]
-        print(HELP.format(version=__version__, commands="\n".join(commands)))
+        show(HELP.format(version=__version__, commands="\n".join(commands)))
         return 0
     if words[0] == "--version":
-        print(f"cadam3d {__version__}")
+        show(f"cadam3d {__version__}")
         return 0
     if words[0] in COMPLETION_FLAGS:
         return complete(words)
@@ -108,7 +110,7 @@ def complete(words: Sequence[str]) -> int:
         if not typed or (len(typed) == 1 and not is_new_word):
             start = typed[0] if typed else ""
             separator = "\n" if shell == "fish" else " "
-            print(separator.join(name for name in COMMANDS if name.startswith(start)))
+            show(separator.join(name for name in COMMANDS if name.startswith(start)))
             return 0
         if typed[0] not in COMMANDS:
             return 0

@@ -12,6 +12,7 @@ from importlib import import_module
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from cadam3d.core.checks import fail, require
+from cadam3d.core.console import show
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import RUN_FOLDER, expanded
 from cadam3d.settings.advice import explain
@@ -138,7 +139,7 @@ def read_line(command: str, words: Sequence[str]) -> Line:
 def _show_page(line: Line) -> None:
     """Print a page: our help, the settings, or one of the pages about Hydra."""
     if line.options.help:
-        print(help_text(line.command, line.overrides, line.folders))
+        show(help_text(line.command, line.overrides, line.folders))
     elif line.is_sweep and line.options.cfg:
         from cadam3d.sweep.plan import read_sweep
 

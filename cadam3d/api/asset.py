@@ -21,6 +21,7 @@ from cadam3d.commands.messages import note_backend
 from cadam3d.commands.opened import OpenedAsset, find_asset, find_run
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import fail, require_choice, require_whole
+from cadam3d.core.console import show
 from cadam3d.core.device import resolve_device
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.mesh.surface import SurfaceSettings
@@ -219,5 +220,5 @@ class Asset:
         path = Path(tempfile.mkdtemp(prefix="cadam3d-"), *HtmlExporter.files)
         with replacing(path) as temporary:
             temporary.write_text(page, encoding="utf-8")
-        print(f"Open this in a browser: {path}")
+        show(f"Open this in a browser: {path}")
         return path

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from cadam3d.callback.base import Callback
 from cadam3d.core.checks import require_range
-from cadam3d.core.console import say
+from cadam3d.core.console import say, visible
 from cadam3d.state import Outcome, RunContext, StepReport, TrainState
 
 GIB = 2**30
@@ -52,7 +52,7 @@ class Progress(Callback):
             self._bar = tqdm(
                 total=context.total_steps,
                 initial=state.step,
-                desc=context.prompt[:TITLE],
+                desc=visible(context.prompt[:TITLE]),
                 unit="step",
                 mininterval=self.refresh_seconds,
                 dynamic_ncols=True,

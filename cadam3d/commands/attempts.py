@@ -1,6 +1,5 @@
 """``cadam3d train attempts=N``: train several seeds, keep all of them, and link the best one."""
 
-import sys
 from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
@@ -9,6 +8,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from cadam3d import report
+from cadam3d.core.console import complain, show
 from cadam3d.core.errors import UserError
 from cadam3d.core.number import preferred
 from cadam3d.io.jsonl import write_json
@@ -57,7 +57,7 @@ def run(
         try:
             report.write_sweep(ended.folder)
         except UserError as error:
-            print(f"cadam3d: {error}", file=sys.stderr)
+            complain(str(error))
     if choice is not None:
         _print(choice, ended.folder)
     elif any(attempt.numbers for attempt in attempts):
@@ -86,8 +86,8 @@ def _keep(choice: Choice, folder: Path) -> None:
 def _print(choice: Choice, folder: Path) -> None:
     """Print why the best attempt was chosen, where its files are, and what to type next."""
     best = folder / f"seed={choice.best}"
-    print(f"\n{choice.sentence}\n\n  {'best':<9}{shown(best)}")
+    show(f"\n{choice.sentence}\n\n  {'best':<9}{shown(best)}")
     for label, path in (("asset", best / ASSET), ("report", folder / REPORT)):
         if path.is_file():
-            print(f"  {label:<9}{shown(path)}")
-    print(f"  {'next':<9}cadam3d view {setting_word('run', shown(best))}", flush=True)
+            show(f"  {label:<9}{shown(path)}")
+    show(f"  {'next':<9}cadam3d view {setting_word('run', shown(best))}")

@@ -10,6 +10,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.commands.messages import note, note_backend
+from cadam3d.core.console import visible
 from cadam3d.io.atomic import remove_leftovers, replacing
 from cadam3d.io.links import link
 from cadam3d.io.lock import INHERITED
@@ -125,7 +126,7 @@ def logged_to(path: Path) -> Iterator[None]:
     The handlers of the root logger get no record that they would not get otherwise.
     """
     file = logging.FileHandler(path, encoding="utf-8")
-    file.setFormatter(logging.Formatter(LOG_LINE))
+    file.setFormatter(_Visible(LOG_LINE))
     file.addFilter(lambda record: record.name != messages.name)
     onward = _Onward(log.getEffectiveLevel())
     level, is_propagating = log.level, log.propagate
@@ -142,6 +143,14 @@ def logged_to(path: Path) -> Iterator[None]:
         log.removeHandler(onward)
         log.removeHandler(file)
         file.close()
+
+
+class _Visible(logging.Formatter):
+    """Formats records so that no text from a file can steer the terminal that shows the log."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line of one record."""
+        return visible(super().format(record))
 
 
 class _Onward(logging.Handler):

@@ -19,6 +19,7 @@ from omegaconf import DictConfig
 from cadam3d import __version__
 from cadam3d.build import component
 from cadam3d.compiled import library
+from cadam3d.core.console import show
 from cadam3d.core.errors import UserError
 from cadam3d.prior.shapes.native_tracer import load_tracer
 from cadam3d.rasterizer import nvrtc
@@ -63,13 +64,13 @@ def run(cfg: DictConfig, _call: Call) -> None:
     findings = list(examine())
     broken = [finding for finding in findings if finding.verdict is Verdict.BROKEN]
     if cfg.json:
-        print(json.dumps({"ok": not broken, "findings": [asdict(finding) for finding in findings]}, indent=2))
+        show(json.dumps({"ok": not broken, "findings": [asdict(finding) for finding in findings]}, indent=2))
     else:
         for finding in findings:
-            print(f"{finding.verdict:<7} {finding.topic:<22} {finding.found}")
+            show(f"{finding.verdict:<7} {finding.topic:<22} {finding.found}")
             if finding.hint:
-                print(f"{'':<31}{finding.hint}")
-        print(f"\n{len(broken)} broken" if broken else "\nReady to train.")
+                show(f"{'':<31}{finding.hint}")
+        show(f"\n{len(broken)} broken" if broken else "\nReady to train.")
     if broken:
         sys.exit(1)
 

@@ -1,7 +1,6 @@
 """``cadam3d eval``: measure the quality of a finished run, or of every run of a sweep."""
 
 import shlex
-import sys
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -14,6 +13,7 @@ from cadam3d.build import component
 from cadam3d.commands.measuring import build_metrics, measure, rebuild_start
 from cadam3d.commands.opened import find_run, open_run, renderer
 from cadam3d.core.checks import require_whole
+from cadam3d.core.console import complain, show
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
@@ -42,9 +42,9 @@ def run(cfg: DictConfig, call: Call) -> None:
         _evaluate_sweep(cfg, call, folder)
         return
     result = evaluate(cfg, call, find_run(str(cfg.run)))
-    print(_as_text(result))
+    show(_as_text(result))
     write_json(folder / EVALUATION, with_earlier(result, folder, cfg.metric))
-    print(f"\n{shown(folder / EVALUATION)}")
+    show(f"\n{shown(folder / EVALUATION)}")
 
 
 def evaluate(cfg: DictConfig, call: Call, folder: Path) -> dict[str, Any]:
@@ -131,18 +131,18 @@ def _evaluate_sweep(cfg: DictConfig, call: Call, folder: Path) -> None:
             measured = evaluate(cfg, call, find_run(str(job)))
         except UserError as error:
             results.append({"run": str(shown(job)), "message": str(error)})
-            print(f"cadam3d: {job.name}: {error}", file=sys.stderr)
+            complain(f"{job.name}: {error}")
             continue
         psnr = psnr_of(measured)
         quality = "no psnr" if psnr is None else f"{psnr:6.2f} dB"
-        print(f"{quality}  {measured['num_gaussians']:>8} Gaussians  {job.name}", flush=True)
+        show(f"{quality}  {measured['num_gaussians']:>8} Gaussians  {job.name}")
         results.append(with_earlier(measured, job, cfg.metric))
         write_json(job / EVALUATION, results[-1])
     if all("message" in result for result in results):
         raise UserError(f"run: no job of {cfg.run} could be measured, for the reasons above")
     write_json(folder / EVALUATION, results)
-    print(f"\n{as_text(write_table(folder))}")
+    show(f"\n{as_text(write_table(folder))}")
     table = report.write_paper_table(folder)
-    print(f"\n{len(results)} jobs: {shown(folder / EVALUATION)}\nreport: {shown(report.write_sweep(folder))}")
+    show(f"\n{len(results)} jobs: {shown(folder / EVALUATION)}\nreport: {shown(report.write_sweep(folder))}")
     if table:
-        print(f"\n{table}")
+        show(f"\n{table}")

@@ -9,6 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d.commands.messages import note
 from cadam3d.commands.opened import OpenedAsset, open_asset, renderer
 from cadam3d.commands.writing import Output, chosen_exporters, run_exporters, write_files
+from cadam3d.core.console import show
 from cadam3d.core.errors import UserError
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.asset_record import FileEntry, axes_of, facts_of, require_own_record, sha256_of, write_record
@@ -36,7 +37,7 @@ def run(cfg: DictConfig, _call: Call) -> None:
     if run_folder is not None:
         set_title(cfg, facts_of(run_folder)["prompt"])
     for output in export(cfg, asset, EXPORTS, has_record=True):
-        print("\n".join(described(output, asset)))
+        show("\n".join(described(output, asset)))
 
 
 def export(cfg: DictConfig, asset: OpenedAsset, name: str, *, has_record: bool) -> list[Output]:

@@ -13,6 +13,7 @@ from cadam3d import __version__
 from cadam3d.build import component, components
 from cadam3d.commands.measuring import build_metrics, measure
 from cadam3d.commands.writing import run_exporters
+from cadam3d.core.console import show
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import Truth
 from cadam3d.exporter.base import Exporter
@@ -118,12 +119,12 @@ def print_result(folder: Path, summary: Mapping[str, Any]) -> None:
     quality = "" if psnr is None else f", PSNR {psnr:.2f} dB"
     if turn := summary.get("turn_deg"):
         quality += f" at a turn of {turn:.0f} degrees"
-    print(
+    show(
         f"{summary['outcome']} after {summary['steps']} steps, {summary['seconds']:.0f} s: "
         f"{summary['num_gaussians']} Gaussians{quality}"
     )
     for label, name in (("asset", ASSET), ("video", TURNTABLE), ("pictures", PREVIEW), ("report", REPORT)):
         if (folder / name).exists():
-            print(f"  {label:<9}{shown(folder / name)}")
+            show(f"  {label:<9}{shown(folder / name)}")
     if summary["outcome"] == Outcome.INTERRUPTED:
-        print(f"  continue with: cadam3d train resume={shown(folder)}")
+        show(f"  continue with: cadam3d train resume={shown(folder)}")

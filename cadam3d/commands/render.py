@@ -9,6 +9,7 @@ from cadam3d.commands.export import export
 from cadam3d.commands.opened import find_run, open_asset, open_run, renderer
 from cadam3d.commands.writing import Output, chosen_exporters, run_exporters, write_files
 from cadam3d.core.checks import fail
+from cadam3d.core.console import show
 from cadam3d.core.errors import UserError
 from cadam3d.core.rendering import Subject
 from cadam3d.exporter.base import Exporter
@@ -36,9 +37,9 @@ def run(cfg: DictConfig, _call: Call) -> None:
             raise UserError("labels: expected null for a single asset, which has no label. Try: labels=null")
         asset = open_asset(cfg)
         outputs, of = export(cfg, asset, "render", has_record=False), f"{len(asset.gaussians)} Gaussians"
-    print(f"{len(outputs)} file(s) of {of}:")
+    show(f"{len(outputs)} file(s) of {of}:")
     for output in outputs:
-        print(f"  {shown(output.path)}")
+        show(f"  {shown(output.path)}")
 
 
 def _compare(cfg: DictConfig) -> tuple[list[Output], list[Subject]]:

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d.commands.messages import note
 from cadam3d.commands.opened import open_run, renderer
 from cadam3d.core.checks import fail, require_range, require_whole
-from cadam3d.core.console import say
+from cadam3d.core.console import say, show
 from cadam3d.core.errors import UserError
 from cadam3d.io.asset_record import sha256_of
 from cadam3d.io.atomic import replacing
@@ -147,11 +147,11 @@ def _write_page(
         temporary.write_text(page, encoding="utf-8")
     write_key(folder / KEY, study, plan, seed=cfg.seed)
     for (one, other), count in sorted(Counter(pair.arms for pair in pairs).items()):
-        print(f"{one} and {other}: {plural(count, 'pair')}")
+        show(f"{one} and {other}: {plural(count, 'pair')}")
     trials = plural(len(plan.trials), "trial")
-    print(f"{trials}, of which {plural(catches, 'catch trial')}; {len(page) / 1e6:.1f} MB")
-    print(f"for the raters:  {shown(folder / PAGE)}")
-    print(f"keep it secret:  {shown(folder / KEY)}")
+    show(f"{trials}, of which {plural(catches, 'catch trial')}; {len(page) / 1e6:.1f} MB")
+    show(f"for the raters:  {shown(folder / PAGE)}")
+    show(f"keep it secret:  {shown(folder / KEY)}")
 
 
 def _evaluate(cfg: DictConfig) -> None:
@@ -170,7 +170,7 @@ def _evaluate(cfg: DictConfig) -> None:
     listed = [{"file": plain(file.name), "reason": plain(reason)} for file, reason in left.items()]
     analysis = analyse(raters, least_caught=float(cfg.least_caught))
     page = markdown(analysis)
-    print(page)
+    show(page)
     place = path.parent
     facts = {
         "study": key.study,
@@ -183,7 +183,7 @@ def _evaluate(cfg: DictConfig) -> None:
         page += f"\nFiles that are left out:\n\n{lines}\n"
     with replacing(place / TABLE) as temporary:
         temporary.write_text(page, encoding="utf-8")
-    print(f"{shown(place / RESULTS)}, {shown(place / TABLE)}")
+    show(f"{shown(place / RESULTS)}, {shown(place / TABLE)}")
 
 
 def _texts(value: Any) -> list[str]:

@@ -1,11 +1,11 @@
 """``cadam3d sweep``: train many times, and write a table and a report that compares the runs."""
 
-import sys
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
 from cadam3d import report
+from cadam3d.core.console import complain, show
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import shown
 from cadam3d.sweep.plan import read_sweep
@@ -27,9 +27,9 @@ def write_report(folder: Path) -> None:
         table = report.write_paper_table(folder)
         page = report.write_sweep(folder)
         if differences := report.comparison(folder):
-            print(f"\nDifferences between arms, medians within cells:\n{differences}\n")
-        print(f"report: {shown(page)}", flush=True)
+            show(f"\nDifferences between arms, medians within cells:\n{differences}\n")
+        show(f"report: {shown(page)}")
         if table:
-            print(f"\n{table}", flush=True)
+            show(f"\n{table}")
     except UserError as error:
-        print(f"cadam3d: {error}", file=sys.stderr)
+        complain(str(error))

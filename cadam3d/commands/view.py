@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 from cadam3d import report
 from cadam3d.commands.opened import find_asset, find_run, require_one
 from cadam3d.core.checks import require_whole
+from cadam3d.core.console import show
 from cadam3d.core.errors import UserError
 from cadam3d.io.asset_file import read_gaussians
 from cadam3d.io.lock import is_held
@@ -31,7 +32,7 @@ def run(cfg: DictConfig, _call: Call) -> None:
     if cfg.run is not None and is_sweep(folder := typed_path(str(cfg.run))):
         page = folder / REPORT if has_file(folder, REPORT) else report.write_sweep(folder)
         is_open = cfg.open and has_display() and webbrowser.open(page.resolve().as_uri())
-        print(f"{'Opened' if is_open else 'Open this in a browser:'} {shown(page)}")
+        show(f"{'Opened' if is_open else 'Open this in a browser:'} {shown(page)}")
         return
     subject = _subject(cfg)
     try:
@@ -41,8 +42,8 @@ def run(cfg: DictConfig, _call: Call) -> None:
         raise UserError(f"port: expected a free port, got {got}. Try: port=0") from error
     tunnel = f"ssh -L {server.server_port}:{HOST}:{server.server_port} {socket.gethostname()}"
     with _ended_by_signals(), server:
-        print(server.address)
-        print(f"Ctrl-C ends the server. To open the address on another machine, first type there: {tunnel}")
+        show(server.address)
+        show(f"Ctrl-C ends the server. To open the address on another machine, first type there: {tunnel}")
         sys.stdout.flush()
         if cfg.open and has_display():
             webbrowser.open(server.address)
@@ -63,7 +64,7 @@ def _ended_by_signals() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        print()
+        show("")
     finally:
         for number, handler in zip(numbers, previous, strict=True):
             signal.signal(number, handler)

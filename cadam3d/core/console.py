@@ -1,9 +1,11 @@
-"""Console: short messages to the user while a command works, which are neither results nor errors.
+"""Console: the one place that prints, so that no text from a stranger's file can steer the terminal.
 
-The command line prints them. A program that uses cadam3d as a library passes them on to its log instead.
+Commands show results, complain about errors, and say what they do meanwhile. A program that uses cadam3d as a
+library passes on what is said to its log instead.
 """
 
 import logging
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,11 +13,30 @@ from contextvars import ContextVar
 
 # Receives a message and its level, as in ``logging``.
 Listener = Callable[[str, int], None]
+# Control characters except line feeds and tabs, marks that reverse the order of letters, halves of letters.
+INVISIBLE = re.compile(
+    "[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u061c\\u200e\\u200f\\u2028-\\u202e\\u2066-\\u2069\\ud800-\\udfff]"
+)
+
+
+def visible(text: str) -> str:
+    """Return ``text`` with the characters that a terminal obeys or cannot show spelled as in Python."""
+    return INVISIBLE.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
+
+
+def show(text: str) -> None:
+    """Print a result on standard output."""
+    print(visible(text), flush=True)
+
+
+def complain(text: str) -> None:
+    """Print an error on standard error. Its further lines cannot pass for messages of ours."""
+    print(f"cadam3d: {visible(text)}".replace("\n", "\n  "), file=sys.stderr, flush=True)
 
 
 def _print(text: str, _level: int) -> None:
     """Print a message on standard error, at once, so that a log can be followed."""
-    print(text, file=sys.stderr, flush=True)
+    print(visible(text), file=sys.stderr, flush=True)
 
 
 _listener: ContextVar[Listener] = ContextVar("listener", default=_print)

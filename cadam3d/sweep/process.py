@@ -17,6 +17,7 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
+from cadam3d.core.console import say
 from cadam3d.core.outcome import Outcome
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.lock import INHERITED, describe_holder, take, unlock
@@ -81,7 +82,7 @@ def _locked(folder: Path, stop: Path) -> Iterator[int | None]:
     with _signals() as signals:
         while (file := take(path)) is None and not signals and not stop.exists():
             if not is_waiting:
-                print(f"{folder.name}: waiting for {describe_holder(path)}", file=sys.stderr, flush=True)
+                say(f"{folder.name}: waiting for {describe_holder(path)}")
                 is_waiting = True
             time.sleep(POLL_SECONDS)
     if file is None:

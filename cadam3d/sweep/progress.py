@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from statistics import mean
 from typing import Any
 
+from cadam3d.core.console import show
 from cadam3d.core.outcome import Outcome
 from cadam3d.io.records import psnr_of, read_summary
 from cadam3d.io.run_folder import ENDED
@@ -34,7 +35,7 @@ def reporting(rows: Sequence[Row]) -> Iterator[None]:
             then = f"; about {duration(left)} left" if waiting else ""
             position = f"{len(rows) - len(waiting):>{len(str(len(rows)))}}/{len(rows)}"
             result = describe_result(read_summary(row.folder))
-            print(f"[{position}] {describe_job(row, keys)}: {result}{then}", flush=True)
+            show(f"[{position}] {describe_job(row, keys)}: {result}{then}")
 
     def watch() -> None:
         while not is_over.wait(POLL_SECONDS):

@@ -6,7 +6,6 @@ The same line always has the same folder, so typing the line again continues the
 import os
 import shlex
 import signal
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.core.checks import fail
+from cadam3d.core.console import complain, say, show
 from cadam3d.core.errors import UserError
 from cadam3d.io.lock import locked
 from cadam3d.io.occupied import in_use
@@ -81,7 +81,7 @@ def run_sweep(
     rows = rows_of(folder, sweep.jobs)
     _refuse_other_settings(rows, sweep.composed, folder, sweep.folder_key)
     if sweep.is_dry:
-        print(f"{_title(sweep, rows)}\n\n{listing(rows)}\n\n{time_left(rows)}")
+        show(f"{_title(sweep, rows)}\n\n{listing(rows)}\n\n{time_left(rows)}")
         return Ended(folder, 0, was_dry=True)
     claim(folder, sweep.folder_key, is_chosen=True)
     lock = locked(folder / LOCK, lambda holder: in_use(folder, holder, sweep.folder_key))
@@ -90,7 +90,7 @@ def run_sweep(
         _write_plan(sweep, overrides, flags)
         on_start(folder)
         rows, problem = load(folder), ""
-        print(_title(sweep, rows))
+        show(_title(sweep, rows))
         try:
             with reporting(rows):
                 problem = _launch(sweep, rows, flags)
@@ -117,10 +117,7 @@ class Stop:
             raise KeyboardInterrupt
         self.received = number
         self._mark.touch()
-        print(
-            "\nStopping as soon as all running jobs have saved; interrupt again to stop at once.",
-            file=sys.stderr,
-        )
+        say("\nStopping as soon as all running jobs have saved; interrupt again to stop at once.")
 
 
 def _refuse_occupied(folder: Path, key: str) -> None:
@@ -220,18 +217,17 @@ def _report_results(sweep: Sweep, rows: Sequence[Row], problem: str) -> int:
     left = [row for row in rows if not row.has_result]
     listed = rows if len(rows) <= LONGEST else left[:LONGEST]
     table = f"\n{as_text(listed)}\n" if listed else ""
-    print(f"{table}\n{sweep.count(len(rows))}: {shown(sweep.folder / TABLE)}", flush=True)
+    show(f"{table}\n{sweep.count(len(rows))}: {shown(sweep.folder / TABLE)}")
     if problem:
-        print(f"cadam3d: {problem}", file=sys.stderr)
+        complain(problem)
     if not left:
         return 0
     counts = Counter(row.outcome for row in left)
     which = ", ".join(f"{number} {outcome}" for outcome, number in counts.items())
-    print(
-        f"cadam3d: {len(left)} of {sweep.count(len(rows))} without a result ({which}); see {CONSOLE} in "
+    complain(
+        f"{len(left)} of {sweep.count(len(rows))} without a result ({which}); see {CONSOLE} in "
         f"their folders, such as {shown(left[0].folder)}. "
-        "Type the same line again to continue.",
-        file=sys.stderr,
+        "Type the same line again to continue."
     )
     return 1
 
