@@ -1,6 +1,7 @@
 """``cadam3d view``: show a run or a file in a browser, and control a run that trains."""
 
 import os
+import shlex
 import signal
 import socket
 import sys
@@ -21,6 +22,7 @@ from cadam3d.io.run_folder import LOCK, REPORT, expanded, has_file, shown, typed
 from cadam3d.live.server import HOST, Server
 from cadam3d.live.subject import ShownFile, ShownRun
 from cadam3d.settings.compose import Call
+from cadam3d.settings.trust import require_contained
 from cadam3d.sweep.folder import is_sweep
 from cadam3d.viewer.pack import pack
 
@@ -30,7 +32,11 @@ def run(cfg: DictConfig, _call: Call) -> None:
     require_whole("port", cfg.port, low=0, high=65535)
     require_one(cfg)
     if cfg.run is not None and is_sweep(folder := typed_path(str(cfg.run))):
-        page = folder / REPORT if has_file(folder, REPORT) else report.write_sweep(folder)
+        page = folder / REPORT
+        if not has_file(page):
+            line = shlex.join(["cadam3d", "eval", f"run={shown(folder)}", "trust=true"])
+            require_contained(folder, line)
+            report.write_sweep(folder)
         is_open = cfg.open and has_display() and webbrowser.open(page.resolve().as_uri())
         show(f"{'Opened' if is_open else 'Open this in a browser:'} {shown(page)}")
         return

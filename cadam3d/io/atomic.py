@@ -22,8 +22,10 @@ def replacing(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f"{TEMPORARY}{os.getpid()}-{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Find out now whether the folder can be written: ffmpeg would only report a broken pipe.
-        temporary.touch()
+        # Find out now whether the folder can be written: ffmpeg would only report a broken pipe. A link with
+        # this name would lead to another file.
+        temporary.unlink(missing_ok=True)
+        temporary.touch(exist_ok=False)
         yield temporary
         # After a power cut, the new name must not point to an empty file, so the contents are written first.
         with temporary.open("rb+") as file:

@@ -57,6 +57,7 @@ def unusable(path: Path, problem: str) -> UserError:
 def regular_descriptor(path: Path, flags: int, *, follows_links: bool = True) -> int:
     """Open a file with ``flags`` of ``os.open``, without waiting, and return its descriptor.
 
+    Unless ``follows_links``, neither a link nor a file with a second name (a hard link) is opened.
     Raises ``UserError`` if ``path`` is not a regular file, and ``OSError`` if it cannot be opened (for a name
     with a null byte, ``ValueError``).
     """
@@ -66,10 +67,12 @@ def regular_descriptor(path: Path, flags: int, *, follows_links: bool = True) ->
     for name in ("O_NONBLOCK", "O_BINARY", "O_CLOEXEC", *(() if follows_links else ("O_NOFOLLOW",))):
         flags |= getattr(os, name, 0)
     descriptor = os.open(path, flags, 0o666)
-    kind = stat.S_IFMT(os.fstat(descriptor).st_mode)
-    if kind != stat.S_IFREG:
+    status = os.fstat(descriptor)
+    kind = stat.S_IFMT(status.st_mode)
+    if kind != stat.S_IFREG or not (follows_links or status.st_nlink <= 1):
         os.close(descriptor)
-        raise unusable(path, f"expected a file, got {KINDS.get(kind, 'something else')}")
+        got = "a hard link" if kind == stat.S_IFREG else KINDS.get(kind, "something else")
+        raise unusable(path, f"expected a file, got {got}")
     return descriptor
 
 

@@ -4,8 +4,9 @@ Hydra builds whatever a ``_target_`` names, so a setting could run any code. A f
 what changes the settings of training: options of the groups, and plain values for settings. A ``_target_``
 must be one that the YAML files of this call (from the package and from ``--config-dir``) name themselves;
 ``cadam3d.settings.check`` refuses one in a wrong place. Nothing from a folder reaches Hydra's own settings,
-an interpolation calls no function, folders of caches are never taken from a run, because compiled kernels are
-loaded from there, and everything in the folder is a file, a folder, or a link that stays inside.
+an interpolation calls no function, and folders of caches are never taken from a run, because compiled kernels
+are loaded from there. Everything in the folder is a file with one name, a folder, or a link that stays
+inside.
 
 With ``trust=true`` in the command line, nothing is judged.
 """
@@ -29,6 +30,7 @@ from cadam3d.core.checks import fail
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import KINDS, read_text, read_yaml
+from cadam3d.io.run_folder import numbered
 from cadam3d.settings.compose import escaped
 from cadam3d.settings.options import TARGET, config_dir
 
@@ -133,6 +135,7 @@ def require_contained(folder: Path, retry: str | None) -> None:
     """Raise ``UserError`` unless ``folder`` holds only files, folders, and links to other places in it.
 
     A command that writes into the folder would otherwise change a file elsewhere, or wait for a pipe forever.
+    A file with a second name (a hard link) is refused too, because that name may be anywhere.
     ``retry`` is the line that trusts the folder; None if it is trusted, so that links may lead anywhere.
     """
     root = folder.resolve()
@@ -142,9 +145,17 @@ def require_contained(folder: Path, retry: str | None) -> None:
             if retry is not None and not target.is_relative_to(root):
                 expected = f"a link to a place in {root.name}"
                 raise UserError(f"{path}: expected {expected}, got one to {target}. Try: {retry}")
-            if path.exists() and not path.is_file() and not path.is_dir():
-                kind = KINDS.get(stat.S_IFMT(path.stat().st_mode), "something else")
-                raise UserError(f"{path}: expected a file, got {kind}. Try: rm {shlex.quote(str(path))}")
+            try:
+                status = path.stat()
+            except OSError:  # a link to nothing, or a file that its process has removed
+                continue
+            kind = stat.S_IFMT(status.st_mode)
+            if retry is not None and kind == stat.S_IFREG and status.st_nlink > 1:
+                copy = shlex.join(["cp", "-r", str(root), str(numbered(root))])
+                raise UserError(f"{path}: expected a file with one name, got a hard link. Try: {copy}")
+            if kind not in (stat.S_IFREG, stat.S_IFDIR):
+                got = KINDS.get(kind, "something else")
+                raise UserError(f"{path}: expected a file, got {got}. Try: rm {shlex.quote(str(path))}")
 
 
 def _raise_unreadable(error: OSError) -> NoReturn:

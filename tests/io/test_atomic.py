@@ -19,6 +19,19 @@ def test_the_temporary_file_keeps_folder_and_suffix(tmp_path):
         assert (temporary.parent, temporary.suffix) == (tmp_path, ".mp4")
 
 
+def test_a_link_with_the_name_of_the_temporary_file_is_replaced_and_not_followed(tmp_path):
+    """The name holds the number of the process, so a stranger can prepare links for all numbers."""
+    outside = tmp_path / "outside"
+    outside.write_text("kept")
+    with replacing(tmp_path / "run/a.txt") as temporary:
+        name = temporary.name
+    (tmp_path / "run" / name).symlink_to(outside)
+    with replacing(tmp_path / "run/a.txt") as temporary:
+        temporary.write_text("new")
+    assert outside.read_text() == "kept"
+    assert (tmp_path / "run/a.txt").read_text() == "new"
+
+
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
 def test_a_failing_block_leaves_the_old_file_and_no_other(tmp_path, error):
     (tmp_path / "a.txt").write_text("old")

@@ -421,6 +421,39 @@ def test_a_link_through_another_link_is_followed_to_its_end(run_folder, tmp_path
         require_contained(run_folder, RETRY)
 
 
+@pytest.mark.parametrize("name", ["train.log", ".lock", ".hydra/hydra.yaml", "metrics.jsonl", "a/b/x"])
+def test_a_hard_link_to_a_file_of_the_user_is_refused_and_the_file_stays(
+    name, run_folder, tmp_path, type_line
+):
+    """A command would write into the file of the user, for example the prompt into a script."""
+    outside = tmp_path / "script.sh"
+    outside.write_text("true\n")
+    (run_folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (run_folder / name).hardlink_to(outside)
+    for command, key in (("train", "resume"), ("eval", "run")):
+        result = type_line(command, f"{key}={run_folder}")
+        assert f"expected a file with one name, got a hard link. Try: cp -r {run_folder}" in result.err
+    assert outside.read_text() == "true\n"
+
+
+def test_view_writes_no_report_into_a_folder_with_a_link_out_of_it(tmp_path, type_line):
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "sweep").mkdir()
+    (tmp_path / "sweep/jobs.json").write_text('{"cwd": ".", "flags": [], "threads": null, "jobs": []}')
+    (tmp_path / "sweep/figures").symlink_to(tmp_path / "outside")
+    assert "figures: expected a link to a place in sweep" in type_line("view", f"run={tmp_path}/sweep").err
+    assert not any((tmp_path / "outside").iterdir())
+
+
+def test_a_new_run_locks_no_file_that_has_a_second_name(tmp_path, type_line):
+    outside = tmp_path / "script.sh"
+    outside.write_text("true\n")
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new/.lock").hardlink_to(outside)
+    assert "got a hard link" in type_line("train", "prompt=a cube", f"hydra.run.dir={tmp_path}/new").err
+    assert outside.read_text() == "true\n"
+
+
 # --- whole commands ---------------------------------------------------------------------------------------
 
 ROUTES = [
