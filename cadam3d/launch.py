@@ -17,17 +17,9 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import RUN_FOLDER, expanded
 from cadam3d.settings.advice import explain
 from cadam3d.settings.check import require_effective, require_settings
-from cadam3d.settings.compose import Call, compose_line, run_hydra
+from cadam3d.settings.compose import Call, compose, run_hydra
 from cadam3d.settings.help import help_text
-from cadam3d.settings.line import (
-    HYDRA_KEYS,
-    OF_SWEEPS,
-    Line,
-    key_of,
-    quoted,
-    read_flags,
-    resumed,
-)
+from cadam3d.settings.line import HYDRA_KEYS, OF_SWEEPS, Line, key_of, quoted, read_flags, resumed
 from cadam3d.settings.options import with_example
 from cadam3d.sweep.plan import require_attempts
 
@@ -72,11 +64,11 @@ def prepare(command: str, words: Sequence[str]) -> tuple[DictConfig, Call]:
     with explaining(command, words):
         line = read_line(command, words)
         shell = f"in a shell: {shlex.join(['cadam3d', command, *words])}"
-        if line.is_sweep or line.wants_page:
-            raise fail(command, expected="a single run without a page", got=line.words, example=shell)
+        is_single = not (line.is_sweep or line.wants_page)
+        require(is_single, command, expected="a single run without a page", got=line.words, example=shell)
         cfg = _composed(line)
-        if cfg.get("attempts", 1) > 1:
-            raise fail("attempts", expected="1 in Python", got=cfg.attempts, example=shell)
+        attempts = cfg.get("attempts", 1)
+        require(attempts == 1, "attempts", expected="1 in Python", got=attempts, example=shell)
         return cfg, _call(line, cfg)
 
 
@@ -101,15 +93,14 @@ def explaining(command: str, words: Sequence[str]) -> Iterator[None]:
     try:
         with completing(words):
             yield
-    except UserError:
-        raise
     except Exception as error:
         # The clean-up of OmegaConf can raise after an interrupt.
         if isinstance(error.__context__, KeyboardInterrupt):
             raise KeyboardInterrupt from error
-        if advice := explain(error, command, words):
-            raise advice from error
-        raise
+        advice = explain(error, command, words)
+        if advice is None or advice is error:
+            raise
+        raise advice from error
 
 
 def read_line(command: str, words: Sequence[str]) -> Line:
@@ -160,7 +151,7 @@ def _composed(line: Line) -> DictConfig:
     # Only a line that trains several attempts may have settings of sweeps.
     of_sweeps = [word for word in line.overrides if is_training and OF_SWEEPS.match(key_of(word))]
     own = [word for word in line.overrides if word not in of_sweeps]
-    cfg = compose_line(line.command, own, line.options)
+    cfg = compose(own, line.command, line.options)
     require_effective(cfg, line.command, own)
     require_settings(cfg)
     runs = cfg.get("run")

@@ -503,7 +503,7 @@ def test_an_interrupt_hidden_by_another_exception_is_still_an_interrupt(type_lin
         finally:
             raise AttributeError("raised by the clean-up")
 
-    monkeypatch.setattr("cadam3d.launch.compose_line", hide)
+    monkeypatch.setattr("cadam3d.launch.compose", hide)
     assert type_line("train", "prompt=a cube").code == 130
 
 

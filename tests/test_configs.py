@@ -174,13 +174,13 @@ def test_an_option_that_chooses_others_sets_nothing_inside_their_groups(path):
     choices, changes = chosen_groups(path), set(read(path)) - {"defaults", path.parent.name}
     assert all(name.startswith("override /") for name in choices)
     assert not changes & set(GROUPS)
-    cfg = compose([PROMPT, f"{path.parent.name}={path.stem}"], with_hydra=True)
+    cfg = compose([PROMPT, f"{path.parent.name}={path.stem}"], flags=NO_FLAGS)
     chosen = cfg.hydra.runtime.choices
     assert all(chosen[name.removeprefix("override /")] == option for name, option in choices.items())
     # Whatever else is typed, or chosen by a recipe, wins.
     other = compose(
         [PROMPT, f"{path.parent.name}={path.stem}", "experiment=mvdream", "camera=sphere", "views=8"],
-        with_hydra=True,
+        flags=NO_FLAGS,
     )
     chosen = other.hydra.runtime.choices
     assert (chosen.prior, chosen.camera, chosen.guidance) == (path.stem, "sphere", "sds_mvdream")
@@ -250,10 +250,10 @@ def choice_of(override: str) -> str:
 
 @cache
 def line_of_jobs(command: str, overrides: tuple[str, ...]) -> DictConfig:
-    return ORIGINAL_COMPOSE_LINE(command, overrides, NO_FLAGS)
+    return ORIGINAL_COMPOSE(overrides, command, NO_FLAGS)
 
 
-ORIGINAL_COMPOSE_LINE = plan.compose_line
+ORIGINAL_COMPOSE = plan.compose
 
 
 @pytest.mark.parametrize("grid", GRIDS)
@@ -262,7 +262,7 @@ def test_every_arm_of_a_grid_composes(grid, monkeypatch):
 
     The number of jobs that the file claims is compared with the product of all.
     """
-    monkeypatch.setattr(plan, "compose_line", lambda command, line, _: line_of_jobs(command, tuple(line)))
+    monkeypatch.setattr(plan, "compose", lambda line, command, _: line_of_jobs(command, tuple(line)))
     text = (CONFIGS / "grid" / f"{grid}.yaml").read_text(encoding="utf-8")
     shared = {
         k: v for k, v in yaml.safe_load(text).get("each", {}).items() if isinstance(v, list) and len(v) > 1

@@ -30,6 +30,7 @@ def explain(error: BaseException, command: str, words: Sequence[str]) -> UserErr
 
     Returns None for an exception that is not one of Hydra or OmegaConf, because that is a bug.
     """
+    text = str(error).strip() or str(error.__cause__ or "")
     match error:
         case UserError():
             return error
@@ -38,31 +39,30 @@ def explain(error: BaseException, command: str, words: Sequence[str]) -> UserErr
         case OverrideParseException():
             key, _, value = error.override.partition("=")
             typed = shlex.quote(f"{key}={quote(value)}")
-            return UserError(f"{key}: cannot read the value ({_first_line(error)}). Try: {typed}")
-        case ValueError() if str(error).startswith(NO_NAME_COMPLAINT):
-            return _no_name(str(error), command, words)
+            reason = text.partition("\n")[0]
+            return UserError(f"{key}: cannot read the value ({reason}). Try: {typed}")
+        case ValueError() if text.startswith(NO_NAME_COMPLAINT):
+            return _no_name(text, command, words)
         case CompactHydraException() | OmegaConfBaseException():
-            return _reworded(error, command, words)
+            return _reworded(error, text, command, words)
     return None
 
 
-def _first_line(error: BaseException) -> str:
-    return str(error).splitlines()[0]
-
-
-def _reworded(error: Exception, command: str, words: Sequence[str]) -> UserError:
+def _reworded(error: Exception, text: str, command: str, words: Sequence[str]) -> UserError:
     """Explain an exception of which only the text shows what is wrong."""
     if isinstance(error, InterpolationResolutionError):
-        key = error.full_key or "a setting"
-        return UserError(f"{key}: {_first_line(error)}. Try: {settings_page(command)}")
-    text = str(error).strip() or str(error.__cause__ or "")
-    if key := re.search(r"Could not override '([^']+)'", text):
-        typed = [word.partition("=")[2] for word in words if key_of(word) == key[1]]
-        return unknown_setting(key[1], _known_keys(key[1], command, words), [*typed, "..."][0], command)
+        reason = text.partition("\n")[0]
+        return UserError(f"{error.full_key or 'a setting'}: {reason}. Try: {settings_page(command)}")
+    if found := re.search(r"Could not override '([^']+)'", text):
+        typed = [word.partition("=")[2] for word in words if key_of(word) == found[1]]
+        return unknown_setting(found[1], _known_keys(found[1], command, words), [*typed, "..."][0], command)
     if sweep := re.search(SWEEP_COMPLAINT, text, re.M):
-        return _several_values(sweep.group(1), command)
+        key, _, value = sweep[1].partition("=")
+        if isinstance(default_options().get(key), list) or command not in ("train", "sweep"):
+            return UserError(f"{key}: a list has brackets. Try: {shlex.quote(f'{key}=[{value}]')}")
+        return UserError(f"{key}: several values make a sweep. Try: cadam3d sweep {shlex.quote(sweep[1])}")
     cause = error.__cause__
-    detail = f" ({_first_line(cause)})" if isinstance(cause, OmegaConfBaseException) else ""
+    detail = f" ({str(cause).splitlines()[0]})" if isinstance(cause, OmegaConfBaseException) else ""
     return UserError(f"{' '.join(text.split()).rstrip('.')}{detail}. Try: cadam3d {command} --help")
 
 
@@ -81,7 +81,7 @@ def _no_name(reason: str, command: str, words: Sequence[str]) -> UserError:
     """Explain that a group has null, a number or a dict where it needs the name of an option."""
     for word in words:
         key, _, value = word.lstrip("+").partition("=")
-        if key and value[:1] != "[" and (options := option_names(key)) and value not in options:
+        if value[:1] != "[" and (options := option_names(key)) and value not in options:
             return unknown_option(key, value, options, command)
     return UserError(f"{reason}. Try: cadam3d {command} --help")
 
@@ -95,11 +95,3 @@ def _known_keys(wrong: str, command: str, words: Sequence[str]) -> list[str]:
             keys = [key for key, _ in flatten(cfg, with_nodes=True)]
             return [key for key in keys if not key.rpartition(".")[2].startswith("_")]
     return []
-
-
-def _several_values(override: str, command: str) -> UserError:
-    """Explain that several values need a sweep, or brackets if they are options of a list."""
-    key, _, value = override.partition("=")
-    if isinstance(default_options().get(key), list) or command not in ("train", "sweep"):
-        return UserError(f"{key}: a list has brackets. Try: {shlex.quote(f'{key}=[{value}]')}")
-    return UserError(f"{key}: several values make a sweep. Try: cadam3d sweep {shlex.quote(override)}")

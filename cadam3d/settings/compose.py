@@ -7,7 +7,6 @@ import sys
 import unicodedata
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -58,37 +57,33 @@ class Call:
         return [Path(source.path) for source in self.hydra.runtime.config_sources if source.schema == "file"]
 
 
-def compose_line(config_name: str, overrides: Sequence[str], options: Namespace) -> DictConfig:
-    """Return the configuration of a line, with Hydra's own node. Raises Hydra's exceptions."""
-    name = options.config_name or config_name
-    return compose(overrides, name, search_path=options.config_dir, with_hydra=True)
-
-
 def compose(
-    overrides: Sequence[str] = (),
-    config_name: str = "train",
-    *,
-    search_path: str | None = None,
-    with_hydra: bool = False,
+    overrides: Sequence[str] = (), config_name: str = "train", flags: Namespace | None = None
 ) -> DictConfig:
     """Return the configuration that ``cadam3d <config_name> <overrides>`` would run with.
 
-    ``search_path`` is one more folder of YAML files, and ``with_hydra`` keeps Hydra's own node. Raises
-    Hydra's exceptions; ``cadam3d.settings.advice`` explains them to the user.
+    The ``flags`` of a line can name another configuration and one more folder of YAML files; with them,
+    Hydra's own node is kept. Raises Hydra's exceptions, which ``cadam3d.settings.advice`` explains.
     """
     register_resolvers()
-    words = list(overrides)
-    if search_path is not None:
-        is_folder = Path(search_path).is_dir()
-        require(is_folder, "--config-dir", expected="a folder", got=search_path, example="--config-dir=.")
+    words, name, place = list(overrides), config_name, "configuration"
+    if flags is not None:
+        name = flags.config_name or name
+    if flags is not None and flags.config_dir is not None:
+        place, folder = "--config-dir", Path(flags.config_dir)
+        require(folder.is_dir(), place, expected="a folder", got=flags.config_dir, example=f"{place}=.")
         typed = [word for word in words if word.startswith(f"{SEARCH_PATH}=")]
         values: list[Any] = [OverridesParser.create().parse_override(word).value() for word in typed]
         more = [path for value in values for path in value]
-        places = ",".join(map(quote, [f"file://{Path(search_path).absolute()}", *more]))
-        words = [*(word for word in words if word not in typed), f"{SEARCH_PATH}=[{places}]"]
+        folders = ",".join(map(quote, [f"file://{folder.absolute()}", *more]))
+        words = [*(word for word in words if word not in typed), f"{SEARCH_PATH}=[{folders}]"]
+    # The calling program may use Hydra itself.
+    outer, version = GlobalHydra.instance().hydra, VersionBase.instance().version_base
+    GlobalHydra.instance().clear()
     try:
-        with _own_hydra():
-            cfg = hydra.compose(config_name, words, return_hydra_config=True)
+        job = JobRuntime.instance().get("name")
+        with hydra.initialize_config_dir(str(config_dir().resolve()), job, VERSION_BASE):
+            cfg = hydra.compose(name, words, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, UserError):
         raise
     # A wrong YAML file, or a deeply nested value, raises an exception of a parser, of a codec or of Python.
@@ -96,28 +91,14 @@ def compose(
         if str(error).startswith(NO_NAME_COMPLAINT):
             raise
         reason = " ".join(str(error).split())[:300] or type(error).__name__
-        where = "--config-dir" if search_path is not None else "configuration"
-        raise UserError(f"{where}: cannot be read ({reason}). Try: cadam3d {config_name} --help") from error
-    if not with_hydra:
-        with open_dict(cfg):
-            cfg.pop("hydra", None)
-    return cfg
-
-
-@contextmanager
-def _own_hydra() -> Iterator[None]:
-    """Initialize Hydra with the package's folder, and restore that of the calling program afterwards."""
-    outer, version = GlobalHydra.instance().hydra, VersionBase.instance().version_base
-    GlobalHydra.instance().clear()
-    try:
-        name = JobRuntime.instance().get("name")
-        with hydra.initialize_config_dir(
-            str(config_dir().resolve()), job_name=name, version_base=VERSION_BASE
-        ):
-            yield
+        raise UserError(f"{place}: cannot be read ({reason}). Try: cadam3d {config_name} --help") from error
     finally:
         GlobalHydra.instance().hydra = outer
         VersionBase.instance().version_base = version
+    if flags is None:
+        with open_dict(cfg):
+            cfg.pop("hydra", None)
+    return cfg
 
 
 def run_hydra(

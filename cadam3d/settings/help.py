@@ -231,8 +231,7 @@ def _spelled(value: Any) -> str:
         return spelled(value) or '""'
     target = str(value.get(TARGET, ""))
     inner = ", ".join(f"{key}={_spelled(each)}" for key, each in value.items() if key != TARGET)
-    is_short = target and not target.startswith(SCHEDULES)
-    return f"{target.rpartition('.')[2]}({'...' if is_short else inner})"
+    return f"{target.rpartition('.')[2]}({inner if target.startswith(SCHEDULES) else '...'})"
 
 
 def _overview(library: Library, command: str, groups: dict[str, Choices]) -> list[str]:
@@ -277,16 +276,14 @@ def _row(setting: Setting) -> tuple[str, str]:
 
 def _table(rows: Iterable[tuple[str, str]]) -> str:
     """Return a table of two columns, the second of which is wrapped."""
-    lines = []
+    blocks = []
     for first, second in rows:
-        wrapped = textwrap.wrap(
-            second, _width() - FIRST_COLUMN, break_long_words=False, break_on_hyphens=False
-        )
-        if len(first) > FIRST_COLUMN - 2:
-            wrapped.insert(0, "")
-        lines.append((first.ljust(FIRST_COLUMN) + (wrapped.pop(0) if wrapped else "")).rstrip())
-        lines += [" " * FIRST_COLUMN + line for line in wrapped]
-    return "\n".join(lines)
+        width = _width() - FIRST_COLUMN
+        text = textwrap.fill(second, width, break_long_words=False, break_on_hyphens=False)
+        text = textwrap.indent(text, " " * FIRST_COLUMN)
+        fits = len(first) <= FIRST_COLUMN - 2
+        blocks.append(first.ljust(FIRST_COLUMN) + text[FIRST_COLUMN:] if fits else f"{first}\n{text}")
+    return "\n".join(block.rstrip() for block in blocks)
 
 
 def _wrapped(text: str) -> str:

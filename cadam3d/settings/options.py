@@ -81,8 +81,8 @@ def read_option(group: str, name: str, folders: Sequence[Path] = ()) -> dict[str
     Those of the options that it builds on are merged. Interpolations stay text. Raises ``UserError`` for an
     option that is unknown or is no dict of YAML.
     """
-    place, values = _read(group, name, folders)
-    for part in reversed(place):
+    values = _merged(group, name, folders)
+    for part in reversed(package_of(group, option_file(group, name, folders))):
         values = {part: values}
     return values
 
@@ -99,10 +99,10 @@ def option_class(group: str, name: str, folders: Sequence[Path] = ()) -> type | 
 
     Raises ``UserError`` if there is no such option, or if its class cannot be imported.
     """
-    place, values = _read(group, name, folders)
-    node = _inside(values, group.split("/")) if not place else values
-    target = node.get(TARGET) if isinstance(node, dict) else None
-    return None if target is None else load_class(target, f"{group}={name}")
+    values = read_option(group, name, folders)
+    place = package_of(group, option_file(group, name, folders)) or group.split("/")
+    target = _inside(values, [*place, TARGET])
+    return None if target == NOTHING else load_class(target, f"{group}={name}")
 
 
 def load_class(target: object, key: str) -> type:
@@ -186,37 +186,31 @@ def spelled(value: Any) -> str:
     return str(value)
 
 
-def _read(group: str, name: str, folders: Sequence[Path]) -> tuple[list[str], dict[str, Any]]:
-    """Return the place of an option in the configuration, and its values with those that it builds on."""
+def _merged(group: str, name: str, folders: Sequence[Path]) -> Any:
+    """Return the values of an option, merged with those that it builds on."""
     path = option_file(group, name, folders)
     content = read_yaml(path)
     if not isinstance(content, dict):
         raise UserError(f"{path}: expected keys with values, got other data. Try: {option_word(group)}")
-    place = package_of(group, path)
     merged: list[Any] = []
     for base in content.pop("defaults", ()):
         if isinstance(base, str) and base != "_self_":
             file, _, below = base.partition("@")
             other, _, option = file.rpartition("/")
-            _, values = _read(other.lstrip("/") or group, option, folders)
+            values = _merged(other.lstrip("/") or group, option, folders)
             merged.append(values if below in ("", "_here_") else {below: values})
     # Hydra merges in the same way.
-    values: Any = OmegaConf.to_container(OmegaConf.merge(*merged, content))
-    return place, values
+    return OmegaConf.to_container(OmegaConf.merge(*merged, content))
 
 
 def _places(key: str) -> Iterator[dict[str, Any]]:
     """Yield the nested values of every YAML file that may have a setting, the likeliest first."""
     yield CHOSEN
-    group, member, *_ = [*key.split("."), ""]
-    names, chosen = option_names(group), default_options().get(group)
-    if not names:
-        for path in sorted(config_dir().glob("*.yaml"), key=lambda path: path.stem != "train"):
-            yield read_yaml(path)
-    for name in sorted(names, key=lambda name: (name != member, name != chosen)):
+    group = key.partition(".")[0]
+    for path in sorted(config_dir().glob("*.yaml"), key=lambda path: path.stem != "train"):
+        yield read_yaml(path)
+    for name in sorted(option_names(group), key=lambda name: name != default_options().get(group)):
         yield read_option(group, name)
-    for name in option_names(f"{group}/{member}"):
-        yield read_option(f"{group}/{member}", name)
 
 
 def _inside(values: Any, parts: Sequence[str]) -> Any:

@@ -53,17 +53,14 @@ CONSTANT = "cadam3d.core.schedule.Constant"
 
 
 def is_trusted(overrides: Sequence[str]) -> bool:
-    """Return whether a command line says ``trust=true``. Raises ``UserError`` for other values of it."""
-    given = [override for override in overrides if override.partition("=")[0].lstrip("+") == "trust"]
-    value = OverridesParser.create().parse_override(given[-1]).value() if given else False
-    if not isinstance(value, bool):
-        raise fail("trust", expected="true or false", got=value, example="trust=false")
-    return value
+    """Return whether a command line says ``trust=true``, and does not take it back."""
+    given = [override.lstrip("+").lower() for override in overrides if _root(override) == "trust"]
+    return given[-1:] == ["trust=true"]
 
 
 def read_overrides(path: Path) -> list[str]:
     """Return the overrides that a run was started with. Raises ``UserError`` if ``path`` is no such list."""
-    lines = [] if (content := read_yaml(path)) is None else content
+    lines = read_yaml(path) or []
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
         raise UserError(f"{path}: expected a list of key=value, got other data. Try: another run")
     return [line for line in lines if _root(line) not in NOT_REPEATED]
@@ -79,8 +76,8 @@ def judge_overrides(
     could do more than change a setting.
     """
     kept = []
-    if (length := sum(map(len, lines))) > LONGEST:
-        _refuse(path, f"{length:,} characters", f"overrides of at most {LONGEST:,} characters", retry)
+    if sum(map(len, lines)) > LONGEST:
+        _refuse(path, str(lines), f"overrides of at most {LONGEST:,} characters", retry)
     for line in lines:
         try:
             override = OverridesParser.create().parse_override(line)
@@ -93,7 +90,7 @@ def judge_overrides(
         if key.rpartition(".")[2] != CACHE:
             kept.append(line)
         elif key not in given:
-            _note_cache(key, path, f"{key}=DIR")
+            _note_cache(key, path)
     return kept
 
 
@@ -113,11 +110,10 @@ def read_components(
     the run is trusted.
     """
     content = read_yaml(path)
-    content = content if isinstance(content, dict) else {}
+    if not isinstance(content, dict) or not isinstance(content.get("prompt"), str):
+        raise UserError(f"{path}: expected the settings of a run, got no prompt. Try: another run")
     keys = [key for key in keys if key in content or key not in optional]
     chosen = {key: content.get(key) for key in ("prompt", "seed", *keys)}
-    if not isinstance(chosen.get("prompt"), str):
-        raise UserError(f"{path}: expected the settings of a run, got no prompt. Try: another run")
     for key in keys:
         node = chosen[key]
         if not isinstance(node, dict) or not isinstance(node.get(TARGET), str):
@@ -126,7 +122,7 @@ def read_components(
             if unknown := _unknown(node, tuple(folders)):
                 _refuse(path, f"{key}: {unknown}", "components that this version of cadam3d has", retry)
             if node.get(CACHE) is not None:
-                _note_cache(f"{key}.{CACHE}", path, "trust=true")
+                _note_cache(f"{key}.{CACHE}", path)
                 node[CACHE] = None
     return DictConfig(escaped(chosen))
 
@@ -229,6 +225,5 @@ def _refuse(path: Path, found: str, expected: str, retry: str) -> NoReturn:
     raise UserError(f"{path}: expected {expected}, got {found[:200]!r}. {code} Try: {retry}")
 
 
-def _note_cache(key: str, path: Path, how: str) -> None:
-    text = f"Note: {key} in {path} is ignored, because code may be loaded from there. To set it, add {how}."
-    say(text, logging.WARNING)
+def _note_cache(key: str, path: Path) -> None:
+    say(f"Note: {key} in {path} is ignored, because code may be loaded from there.", logging.WARNING)

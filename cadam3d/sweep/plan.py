@@ -18,7 +18,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import RUN_FOLDER, typed_path
 from cadam3d.settings.advice import explain
 from cadam3d.settings.check import require_effective, require_settings
-from cadam3d.settings.compose import compose_line, flatten
+from cadam3d.settings.compose import compose, flatten
 from cadam3d.settings.line import DRY_RUN, LAUNCHER_KEY, SWEEP_FOLDER, key_of
 from cadam3d.settings.options import with_example
 from cadam3d.sweep.folder import Job
@@ -187,7 +187,7 @@ class Composer:
         return self._bases[known]
 
     def _base(self, overrides: Sequence[str]) -> Base:
-        return Base.of(compose_line("train", [*self._common, *overrides], self._options))
+        return Base.of(compose([*self._common, *overrides], "train", self._options))
 
 
 def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> Sweep:
@@ -232,7 +232,7 @@ def compose_sweep(parts: Parts, options: Namespace) -> DictConfig:
     """
     # The flag --config-name is for the jobs and not for the sweep itself.
     own = Namespace(**{**vars(options), "config_name": None})
-    cfg = compose_line("sweep", parts.own, own)
+    cfg = compose(parts.own, "sweep", own)
     # A wrong setting of the launcher is found now, and not when the jobs are there.
     OmegaConf.to_container(cfg.hydra.launcher, resolve=True)
     is_answer = isinstance(cfg[DRY_RUN], bool)

@@ -609,8 +609,8 @@ def test_settings_changed_after_composing_equal_those_that_hydra_composes(sweep)
 
 def test_many_jobs_that_differ_in_values_are_composed_once(sweep, monkeypatch):
     counted = []
-    original = plan.compose_line
-    monkeypatch.setattr(plan, "compose_line", lambda *args: counted.append(args) or original(*args))
+    original = plan.compose
+    monkeypatch.setattr(plan, "compose", lambda *args: counted.append(args) or original(*args))
     line = ["prompt='a cube'", "seed=range(0,30)", "densifier.tau_Q=0.5,0.7"]
     found = plan.read_sweep("sweep", line, read_flags([])[0]).composed
     assert [job.get("seed") for job in found] == [seed for seed in range(30) for _ in range(2)]
