@@ -14,17 +14,18 @@ from cadam3d.core.checks import fail
 def resolve_device(name: str) -> torch.device:
     """Return the device ``name``: ``auto`` is CUDA if available, else the CPU; other names are torch's.
 
-    Raises ``UserError`` for a name that torch does not know, or a device that this machine does not have.
+    Raises ``UserError`` for a name that torch does not know, or a device that this machine does not have or
+    that cannot compute in float64, such as Apple's ``mps``.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
         # Reading a value back also refuses "meta", a device without memory.
-        torch.zeros(1, device=device).item()
+        torch.zeros(1, dtype=torch.float64, device=device).item()
     except (RuntimeError, AssertionError, TypeError) as error:
         reason = str(error).strip().splitlines()[0]
-        expected = f"a device of this machine ({reason})"
+        expected = f"a device of this machine with float64 ({reason})"
         raise fail("device", expected=expected, got=name, example="device=cpu") from error
     return device
 

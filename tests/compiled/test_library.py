@@ -224,6 +224,15 @@ def test_files_of_another_user_are_refused_also_behind_a_link(place, cached, tmp
         assert find_intact(link, "small-*.so") is None
 
 
+def test_on_windows_where_files_have_no_such_owners_a_library_is_built_and_found(
+    library, fake_compiler, tmp_path, monkeypatch
+):
+    monkeypatch.delattr(os, "geteuid")
+    fake_compiler()
+    cache = own_folder(tmp_path / "cache", NAMES)
+    assert build(library, cache) == find_cached(library, cache, None)
+
+
 def test_a_new_folder_and_a_new_library_belong_to_the_user_alone(library, fake_compiler, tmp_path):
     fake_compiler()
     before = os.umask(0o002)
