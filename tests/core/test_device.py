@@ -18,9 +18,7 @@ def test_the_gpu_of_a_mac_is_refused_by_name_because_it_has_no_float64(monkeypat
         return zeros(*size, dtype=dtype)
 
     monkeypatch.setattr(torch, "zeros", as_on_a_mac)
-    with pytest.raises(
-        UserError, match=r"^device: .* float64 .*MPS.*, got 'mps'\. Try: device=cpu$"
-    ):
+    with pytest.raises(UserError, match=r"^device: .* float64 .*MPS.*, got 'mps'\. Try: device=cpu$"):
         resolve_device("mps")
     assert resolve_device("auto").type in ("cpu", "cuda")
 
