@@ -76,7 +76,9 @@ def chosen_groups(path: Path) -> dict[str, str]:
 def with_base(path: Path) -> dict[str, Any]:
     """Return the keys of a file and of the files that it builds on."""
     content = read(path)
-    bases = [entry for entry in content.pop("defaults", []) if isinstance(entry, str) and entry != "_self_"]
+    # An entry with @ makes another node, below or beside this one.
+    entries = [entry for entry in content.pop("defaults", []) if isinstance(entry, str)]
+    bases = [entry for entry in entries if entry != "_self_" and "@" not in entry]
     return {key: value for base in bases for key, value in with_base(path.with_stem(base)).items()} | content
 
 

@@ -91,7 +91,7 @@ def same(left: dict, right: dict) -> bool:
     return True
 
 
-@pytest.mark.parametrize("densifier", ["cadam", "baseline", "absgrad", "none", "random", "mcmc"])
+@pytest.mark.parametrize("densifier", ["cadam", "baseline", "absgs", "none", "random", "mcmc"])
 def test_the_same_seed_gives_the_same_bytes(tmp_path, densifier):
     payloads = []
     for _ in range(2):
@@ -109,7 +109,7 @@ def test_the_fallback_of_an_initializer_is_recorded_in_checkpoints():
     assert restore(trainer, state.to_payload()).initial_note == state.initial_note
 
 
-@pytest.mark.parametrize("densifier", ["cadam", "baseline", "random", "mcmc"])
+@pytest.mark.parametrize("densifier", ["cadam", "baseline", "absgs", "random", "mcmc"])
 @pytest.mark.parametrize("cut", [1, 4, 5])
 def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, densifier, cut):
     trainer, whole = make([f"densifier={densifier}"])
@@ -122,6 +122,15 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, densifie
     resumed = restore(trainer, torch.load(tmp_path / "half.pt", weights_only=True))
     assert go(trainer, resumed, tmp_path) is Outcome.FINISHED
     assert same(whole.to_payload(), resumed.to_payload())
+
+
+def test_a_reset_follows_the_refinement_of_its_step(tmp_path):
+    trainer, state = make(["densifier=baseline", "densifier.tau_pos=1e-9"])
+    recorder = Recorder()
+    go(replace(trainer, steps=4, callbacks=[recorder]), state, tmp_path)
+    last = recorder.refinements[-1]
+    assert (last.step, last.reset) == (4, last.after)
+    assert last.after > last.before
 
 
 def test_densifiers_with_one_seed_see_the_same_views_and_noise(tmp_path):

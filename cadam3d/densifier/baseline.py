@@ -1,6 +1,7 @@
 """3DGS adaptive density control: grow where the view-space gradient is large on average (paper eq. 1)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,6 +14,7 @@ from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
 from cadam3d.densifier.base import Densifier, GradientSignal
 
 VIEWS = ("sum_norm", "sum_vector", "last")
+Sums = TypeVar("Sums", bound="BaselineState")
 
 
 @dataclass
@@ -25,9 +27,7 @@ class BaselineState(RowState):
 
     def carry(self, edit: RowEdit) -> "BaselineState":
         """Return zeros for survivors too, because 3DGS averages over one refinement interval at a time."""
-        return BaselineState(
-            **{name: rows.new_zeros(edit.rows_after) for name, rows in self.to_dict().items()}
-        )
+        return type(self)(**{name: rows.new_zeros(edit.rows_after) for name, rows in self.to_dict().items()})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,15 +60,11 @@ class Baseline(Densifier[BaselineState]):
             radius=torch.zeros(n, device=device),
         )
 
-    def observe(self, state: BaselineState, signal: GradientSignal) -> BaselineState:
+    def observe(self, state: Sums, signal: GradientSignal) -> Sums:
         """Return the sums after one more batch. A gradient that is not finite counts as not seen."""
-        # Each axis is scaled separately, because broadcasting over rows of two is slow.
-        x, y = self._pulls(signal).unbind(dim=-1)
-        # An NDC unit is half the image size.
-        x = x * (self.grad_multiplier * signal.width / 2)
-        y = y * (self.grad_multiplier * signal.height / 2)
-        norms, sightings = self._norms(x, y, signal.visible)
-        return BaselineState(
+        norms, sightings = self._norms(self._pulls(signal), signal)
+        return replace(
+            state,
             norm_sum=state.norm_sum + norms,
             sightings=state.sightings + sightings,
             radius=torch.maximum(state.radius, signal.radii.amax(dim=0)),
@@ -134,15 +130,20 @@ class Baseline(Densifier[BaselineState]):
         return signal.means2d
 
     def _norms(
-        self, x: Float[Tensor, "v n"], y: Float[Tensor, "v n"], visible: Bool[Tensor, "v n"]
+        self, pulls: Float[Tensor, "v n 2"], signal: GradientSignal
     ) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
         """Return what a batch adds to the sum of norms and to their number. Published codes differ in this.
 
         ``sum_norm``: every view counts separately (gsplat, gsgen). ``sum_vector``: the norm of the sum, one
         count per batch (GaussianDreamer). ``last``: only the last view (LucidDreamer, FlowDreamer, GCS-BEG).
         """
+        # Each axis is scaled separately, because broadcasting over rows of two is slow.
+        x, y = pulls.unbind(dim=-1)
+        # An NDC unit is half the image size.
+        x = x * (self.grad_multiplier * signal.width / 2)
+        y = y * (self.grad_multiplier * signal.height / 2)
         norms = torch.hypot(x, y)
-        seen = visible & norms.isfinite()
+        seen = signal.visible & norms.isfinite()
         if self.views == "sum_norm":
             return norms.where(seen, 0.0).sum(dim=0), seen.sum(dim=0, dtype=torch.int32)
         if self.views == "sum_vector":

@@ -146,7 +146,7 @@ class Refine:
         the edit that are pruned too, after the same step as by ``max_scale``; ``None`` marks no row.
         """
         gaussians = gaussians.detach()
-        is_split = selected & (gaussians.scales.amax(dim=-1) > self.tau_scale)
+        is_split = selected & self.splits(gaussians)
         clones, splits = (selected & ~is_split).nonzero()[:, 0], is_split.nonzero()[:, 0]
         children = concatenate([gaussians.index(clones), self._split(gaussians.index(splits), generator)])
         parents = torch.cat([clones, splits.repeat_interleave(self.split_children)])
@@ -167,6 +167,10 @@ class Refine:
             split=len(splits),
             pruned=grown - edit.rows_after,
         )
+
+    def splits(self, gaussians: Gaussians) -> Bool[Tensor, "n"]:
+        """Return the mask of Gaussians that split if they are selected; the others are cloned."""
+        return gaussians.scales.amax(dim=-1) > self.tau_scale
 
     def keeps(self, gaussians: Gaussians, step: int) -> Bool[Tensor, "n"]:
         """Return the mask of Gaussians that are not pruned.
