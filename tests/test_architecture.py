@@ -234,7 +234,8 @@ def test_a_private_part_of_hydra_is_noticed(line):
 
 def test_core_imports_only_array_packages_and_the_standard_library():
     allowed = {"torch", "numpy", "kornia", "jaxtyping", "cadam3d", *sys.stdlib_module_names}
-    allowed |= {"scipy", "skimage", "fast_simplification"}  # for surfaces
+    allowed |= {"scipy", "skimage", "fast_simplification", "trimesh"}  # for surfaces
+    allowed |= {"tqdm"}  # for bars
     guilty = {
         f"{path.name}: {module}"
         for path in sources()

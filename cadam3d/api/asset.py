@@ -56,8 +56,8 @@ def load(
 ) -> "Asset":
     """Return the asset in a run folder, or in a file of any format that cadam3d reads.
 
-    The format is recognised by the content: PLY, compressed PLY, ``.splat`` or SPZ. ``up`` is the up axis of
-    a file that does not record it (``-y``, ``+y`` or ``+z``; None is the usual one of its format). ``device``
+    The format is recognised by the content: PLY, compressed PLY, glb, SPZ, SOG, ``.splat`` or ``.ksplat``.
+    ``up`` is the up axis of a file that does not record it (``-y``, ``+y`` or ``+z``; None is -y). ``device``
     holds the Gaussians: ``auto`` is CUDA if there is one, else the CPU. ``rasterizer`` is an option of the
     group ``rasterizer``.
 
@@ -73,7 +73,7 @@ def load(
         title = prompt if isinstance(prompt, str) else None
     else:
         title = place.stem
-    gaussians = read_gaussians(place, up=up).to(resolve_device(device))
+    gaussians = read_gaussians(place, up=up, key="up").to(resolve_device(device))
     return Asset(gaussians, source=place, title=title, rasterizer=renders)
 
 

@@ -7,9 +7,12 @@ library passes on what is said to its log instead.
 import logging
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import TypeVar
+
+T = TypeVar("T")
 
 # Receives a message and its level, as in ``logging``.
 Listener = Callable[[str, int], None]
@@ -39,6 +42,8 @@ def _print(text: str, _level: int) -> None:
     print(visible(text), file=sys.stderr, flush=True)
 
 
+DELAY_S = 1.0  # before a bar appears
+
 _listener: ContextVar[Listener] = ContextVar("listener", default=_print)
 
 
@@ -58,3 +63,23 @@ def heard_by(listener: Listener) -> Iterator[None]:
         yield
     finally:
         _listener.reset(token)
+
+
+def followed(items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+    """Yield ``items``; on a terminal, work of more than a second shows a bar on standard error meanwhile."""
+    from tqdm import tqdm  # slow to import
+
+    yield from tqdm(items, label, total, leave=False, delay=DELAY_S, disable=None)
+
+
+@contextmanager
+def working(label: str) -> Iterator[Callable[[], object]]:
+    """Show on a terminal how long the block works, if it takes more than a second.
+
+    The block gets a function, which it calls often and which updates the time.
+    """
+    from tqdm import tqdm  # slow to import
+
+    look = "{desc}: {elapsed}, Ctrl-C ends it"
+    with tqdm(desc=label, bar_format=look, leave=False, delay=DELAY_S, disable=None) as bar:
+        yield lambda: bar.update(1)

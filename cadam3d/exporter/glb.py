@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+from cadam3d.core.checks import require_choice
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.exporter.base import AssetExporter
-from cadam3d.io.glb import write_glb
+from cadam3d.io.glb import COLORS, write_glb
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,6 +18,16 @@ class GlbExporter(AssetExporter):
     files: ClassVar = ("asset.glb",)
     hint: ClassVar = "needs a program that knows KHR_gaussian_splatting; for triangles type 'exporter=[mesh]'"
 
+    colors: str  # one of COLORS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_choice("exporter.glb.colors", self.colors, tuple(COLORS))
+
     def write(self, path: Path, gaussians: Gaussians) -> None:
         """Write the file atomically. Raises ``UserError`` if it cannot be written."""
-        write_glb(path, gaussians, up=self.up)
+        write_glb(path, gaussians, up=self.up, colors=self.colors)
+
+    def losses(self, sh_degree: int) -> str:
+        """Return what linear colours change; a file with the colours of the display loses nothing."""
+        return "" if self.colors == "display" else "has linear colours, so soft edges look thinner"

@@ -20,7 +20,7 @@ from cadam3d.initializer.points import (
     require_copies,
     rows_of,
 )
-from cadam3d.io.asset_file import PLY, file_format, read_gaussians
+from cadam3d.io.asset_file import PLY, file_format, read_gaussians, say_assumed
 from cadam3d.io.frames import UPS, points_to_world, turned, turned_points
 from cadam3d.io.ply import holds_gaussians, read_points
 from cadam3d.io.ply_tables import read_header
@@ -35,7 +35,7 @@ SURFACES = ("face", "tristrips")
 class Ply(FromObject):
     """The Gaussians of a file, or the points of a PLY file; the prompt is not used.
 
-    Gaussians (PLY, compressed PLY, .splat or SPZ, any SH degree, written by any program) keep their shapes,
+    Gaussians (any format of ``io/asset_file.py``, any SH degree, written by any program) keep their shapes,
     colours and opacities. Points (text or binary, for example from Point-E or a scan) become round Gaussians
     with their colours.
     """
@@ -72,7 +72,7 @@ class Ply(FromObject):
             expected="1, since this file holds Gaussians",
             got=self.replicate,
         )
-        asset = turned(read_gaussians(path, up=self.up), self.turn_deg)
+        asset = turned(read_gaussians(path, up=self.up, key="initializer.up"), self.turn_deg)
         _require_finite(path, "means", asset.means)
         asset = asset.index(rows_of(len(asset), self.count, generator))
         means, factor = self.placed(asset.means)
@@ -90,6 +90,8 @@ class Ply(FromObject):
                 "mesh. Try: initializer=mesh"
             )
         positions, colors = read_points(header)
+        if self.up is None:
+            say_assumed(path, UP_OF_POINTS, "initializer.up")
         points = torch.from_numpy(positions)
         _require_finite(path, "points", points)
         rgb = one_color(self.color, len(points)) if colors is None else torch.from_numpy(colors)

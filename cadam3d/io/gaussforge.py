@@ -1,7 +1,7 @@
-"""SOG, ksplat and SPZ version 4, written by the optional package gaussforge (Apache-2.0, compiled C++).
+"""SOG, ksplat and SPZ version 4, through the optional package gaussforge (Apache-2.0, compiled C++).
 
-cadam3d only writes with gaussforge. It does not read with it, because gaussforge is compiled code that makes
-no promise about hostile files.
+gaussforge makes no promise about hostile files, and cannot be interrupted. It therefore works in a process of
+its own, with limits of memory and time if it reads. A file is converted into a PLY, which this program reads.
 
 | format | content | lost |
 |---|---|---|
@@ -18,6 +18,7 @@ Measured facts about gaussforge 0.6.0, which the code below takes into account. 
 * refuses to write SOG and ksplat without a Gaussian;
 * writes the SH coefficients of ksplat in another order than Spark, three.js and splat-transform read them,
   which changes degree 2 and higher;
+* reads these coefficients in the same order as it writes them;
 * prints to standard output when it reads, and cannot return a file of SH degree 0 to Python.
 
 ksplat is the format of GaussianSplats3D, which has SH degree 0 to 2 (its README and its issue 259).
@@ -26,19 +27,29 @@ Sources: the metadata of gaussforge 0.6.0 on pypi.org, and comparisons of its fi
 3.7.0, Spark 2.2.0 and three.js r187 read.
 """
 
-from importlib import import_module
+import marshal
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cadam3d.core.checks import require_choice
+from cadam3d.core.console import working
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.atomic import replacing
 from cadam3d.io.encoding import in_file_axes, unit_quats
+from cadam3d.io.frames import UPS, file_to_world
+from cadam3d.io.ply import read_ply
+from cadam3d.io.reading import opened, unusable
 
 PACKAGE = "gaussforge"
 # Numbers beyond these show no difference, but could cost the precision of the others.
@@ -46,8 +57,27 @@ LARGEST_LOG = 20.0  # of scales and opacities
 LARGEST_SH = 20.0
 FARTHEST_SPZ4 = 2047.0  # 24 bits, of which 12 are fractional
 KSPLAT_SH_DEGREE = 2
-# How a user reads what cadam3d does not read.
-CONVERSION = f"pip install {PACKAGE}, which converts it into a ply"
+# Limits of a process that reads: bytes for each byte of the file, bytes in addition, and seconds of work.
+MOST_EXPANSION, SPARE_BYTES, MOST_SECONDS = 256, 1 << 30, 600
+# Calls a method of gaussforge. Standard output carries nothing but the answer.
+PROGRAM = """
+import marshal, os, sys
+answer = os.fdopen(os.dup(1), "wb")
+os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+limits, name, arguments, options = marshal.load(sys.stdin.buffer)
+if limits and os.name == "posix":
+    import resource
+    for kind, limit in zip((resource.RLIMIT_AS, resource.RLIMIT_CPU), limits):
+        try:
+            resource.setrlimit(kind, (limit, limit))
+        except (ValueError, OSError):  # not every system has both
+            pass
+import gaussforge
+result = getattr(gaussforge.GaussForge(), name)(*arguments, **options)
+if "error" in result:
+    sys.exit(str(result["error"]))
+answer.write(result["data"])
+"""
 
 
 def require_gaussforge(key: str) -> None:
@@ -60,7 +90,7 @@ def write_sog(path: Path, gaussians: Gaussians, *, up: str) -> None:
     """Write ``gaussians`` as SOG version 2, atomically, in the axes with up axis ``up``.
 
     Raises ``UserError`` if there are no Gaussians, if gaussforge is not installed or fails, or if the file
-    cannot be written. The other two functions do the same.
+    cannot be written. The other two writers do the same.
     """
     _write(path, gaussians, up=up, kind="sog")
 
@@ -102,11 +132,73 @@ def _write(path: Path, gaussians: Gaussians, *, up: str, kind: str) -> None:
         "meta": {"shDegree": round((rest.shape[1] + 1) ** 0.5) - 1, "sourceFormat": "ply"},
     }
     require_gaussforge(f"exporter.{kind}")
-    result = import_module(PACKAGE).GaussForge().write(cloud, kind, spz_version=4)
-    if "error" in result:
-        raise UserError(f"{path}: gaussforge cannot write it ({result['error']}). Try: 'exporter=[ply]'")
+    content, problem = _forged(path.name, None, "write", (cloud, kind), {"spz_version": 4})
+    if problem:
+        raise UserError(f"{path}: gaussforge cannot write it ({problem}). Try: 'exporter=[ply]'")
     with replacing(path) as temporary:
-        temporary.write_bytes(result["data"])
+        temporary.write_bytes(content)
+
+
+def read_forged(path: Path, kind: str, *, up: str = "-y") -> Gaussians:
+    """Read a file of the format ``kind`` (sog, ksplat or spz) into world axes, on the CPU, as float32.
+
+    ``up`` is the up axis of the file. Raises ``UserError`` if gaussforge is not installed, or if it cannot
+    read the file.
+    """
+    require_choice("up", up, UPS)
+    require_gaussforge(str(path))
+    with opened(path) as file:
+        content = file.read()
+    limits = (MOST_EXPANSION * len(content) + SPARE_BYTES, MOST_SECONDS)
+    ply, problem = _forged(path.name, limits, "convert", (content, kind, "ply"), {})
+    if problem:
+        raise unusable(path, f"gaussforge cannot read it ({problem})")
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder, "copy.ply")
+        copy.write_bytes(ply)
+        try:
+            local = read_ply(copy, up="+z")
+        except UserError as error:
+            raise UserError(str(error).replace(str(copy), str(path))) from error
+    if kind == "ksplat":
+        local = replace(local, sh=torch.cat([local.sh[:, :1], _from_bands(local.sh[:, 1:])], dim=1))
+    return file_to_world(local, up)
+
+
+def _forged(
+    label: str, limits: tuple[int, int] | None, name: str, arguments: tuple[Any, ...], options: dict[str, Any]
+) -> tuple[bytes, str]:
+    """Return the data that a method of gaussforge returns, and what went wrong; "" if nothing did.
+
+    The work is done in a process, which ends if this one is interrupted. ``label`` is shown meanwhile.
+    """
+    # With -P, no file in the current folder is imported. A session of its own gets no Ctrl-C.
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-c", PROGRAM],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+    request: bytes | None = marshal.dumps((limits, name, arguments, options))
+    with process, working(label) as refresh:
+        try:
+            while True:
+                try:
+                    content, errors = process.communicate(request, timeout=0.5)
+                    break
+                except subprocess.TimeoutExpired:
+                    request = None
+                    refresh()
+        except BaseException:
+            process.kill()
+            raise
+    if process.returncode == 0:
+        return content, ""
+    lines = errors.decode(errors="replace").split("\n")
+    reason = next((line for line in reversed(lines) if line.strip()), "")
+    plain = "".join(each for each in reason if each.isprintable())[:200]
+    return b"", plain or f"it ended with {process.returncode}"
 
 
 def _by_bands(rest: Float[Tensor, "n r 3"]) -> Float[Tensor, "n r 3"]:
@@ -121,6 +213,16 @@ def _by_bands(rest: Float[Tensor, "n r 3"]) -> Float[Tensor, "n r 3"]:
         bands.append(rest[:, first : first + size].mT.flatten(1))
         first += size
     return torch.cat([rest[:, :0, 0], *bands], dim=1).reshape(len(rest), 3, rest.shape[1]).mT
+
+
+def _from_bands(rest: Float[Tensor, "n r 3"]) -> Float[Tensor, "n r 3"]:
+    """Return the coefficients of a correct ksplat file that gaussforge has read, the inverse of the above."""
+    flat, bands = rest.mT.flatten(1), []
+    while sum(band.shape[1] for band in bands) < rest.shape[1]:
+        size = 2 * len(bands) + 3
+        first = 3 * sum(band.shape[1] for band in bands)
+        bands.append(flat[:, first : first + 3 * size].reshape(-1, 3, size).mT)
+    return torch.cat(bands, dim=1) if bands else rest
 
 
 def _bytes(tensor: Tensor) -> bytes:

@@ -1,4 +1,4 @@
-"""Binary glTF 2.0: one mesh in a JSON document and one buffer, for Gaussians and for triangles."""
+"""Binary glTF 2.0: a JSON document and one buffer, for Gaussians and for triangles."""
 
 import json
 import struct
@@ -12,14 +12,17 @@ from jaxtyping import Float
 from cadam3d import __version__
 from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
+from cadam3d.io.reading import opened, unusable
 
 LARGEST_FILE = (1 << 32) - 1  # bytes; the file stores its length in 32 bits
 SPARE_BYTES = 1 << 20  # for the document
 HEADER = struct.Struct("<4sII")  # "glTF", version, length of the file
 CHUNK = struct.Struct("<I4s")  # length, kind
 # Types of numbers (glTF 2.0, section 3.6.2) by the kind of an array.
-COMPONENTS = {"f4": 5126, "u1": 5121, "u2": 5123, "u4": 5125}
+COMPONENTS = {"f4": 5126, "i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125}
 TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+# Exceptions for a document that does not follow the specification.
+DAMAGES = (LookupError, TypeError, ValueError, AttributeError, StopIteration, OverflowError, RecursionError)
 # Uses of a part of the buffer (section 5.11.5).
 VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
 
@@ -92,9 +95,51 @@ def _accessor(number: int, array: np.ndarray) -> dict[str, Any]:
     return accessor | {"type": TYPES[array.shape[1]]} | ({"normalized": True} if kind in ("u1", "u2") else {})
 
 
+def read_gltf(path: Path) -> tuple[Any, bytes]:
+    """Return the JSON document of a file and its buffer. Raises ``UserError`` if it cannot be read."""
+    with opened(path) as file:
+        content = file.read()
+    try:
+        magic, version, _ = HEADER.unpack_from(content)
+        length, kind = CHUNK.unpack_from(content, HEADER.size)
+        start = HEADER.size + CHUNK.size
+        if (magic, version, kind) != (b"glTF", 2, b"JSON"):
+            raise ValueError("no glTF 2.0")
+        document = json.loads(content[start : start + length])
+        body = b""
+        if start + length < len(content):
+            size, _ = CHUNK.unpack_from(content, start + length)
+            body = content[start + length + CHUNK.size :][:size]
+    except (ValueError, struct.error, RecursionError) as error:
+        raise unusable(path, f"not a readable glb file ({str(error)[:100]})") from error
+    return document, body
+
+
+def attribute(document: Any, body: bytes, number: int) -> Float[np.ndarray, "n c"]:
+    """Return the numbers of an accessor of a file; integers become shares of the largest one.
+
+    Raises one of ``DAMAGES`` if the document does not describe numbers of the buffer.
+    """
+    accessor = document["accessors"][number]
+    view = document["bufferViews"][accessor["bufferView"]]
+    kind = next(name for name, code in COMPONENTS.items() if code == accessor["componentType"])
+    width = next(size for size, name in TYPES.items() if name == accessor["type"])
+    row = np.dtype(f"<{kind}").itemsize * width
+    stride, first = view.get("byteStride", row), accessor.get("byteOffset", 0)
+    start = view.get("byteOffset", 0)
+    is_here = view["buffer"] == 0 and min(first, start, accessor["count"], stride - row) >= 0
+    if "sparse" in accessor or not is_here:
+        raise ValueError("an accessor of another kind")
+    part = body[start : start + view["byteLength"]]
+    values = np.ndarray((accessor["count"], width), f"<{kind}", part, first, (stride, row // width))
+    if kind == "f4":
+        return values
+    return np.maximum(values / np.iinfo(kind).max, -1.0)
+
+
 def linear(rgb: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
     """Return linear light for sRGB colours, both in [0, 1] (IEC 61966-2-1)."""
-    return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return np.where(rgb <= 0.04045, rgb / 12.92, ((np.maximum(rgb, 0) + 0.055) / 1.055) ** 2.4)
 
 
 def srgb(light: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:

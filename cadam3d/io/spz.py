@@ -17,8 +17,9 @@ The quaternion of version 3 is a 32-bit integer. Its highest two bits are the in
 in the order x, y, z, w, which is positive (or all signs change). Ten bits for each of the other three follow
 in this order: a sign, and the magnitude in nine bits, where 511 means 1/sqrt(2).
 
-The specification calls the axes "right, up, back", so files are +y up. Other programs write the numbers of a
-PLY unchanged, which is -y up; the file does not tell them apart, and ``up`` chooses. Bit 0 of the flags means
+The specification calls the axes "right, up, back", which is +y up. But the programs that write most files
+(splat-transform, gaussforge) write the numbers of a PLY unchanged, which is -y up, so this is the default
+here. The file does not tell them apart, and ``up`` chooses. Bit 0 of the flags means
 that the Gaussians were trained with an antialiasing filter; it is not read, and written as 0. Bit 1 means
 that extensions of vendors follow the Gaussians; they are skipped.
 
@@ -57,10 +58,9 @@ from cadam3d.io.encoding import (
 )
 from cadam3d.io.frames import UPS
 from cadam3d.io.gathering import gathered
-from cadam3d.io.gaussforge import CONVERSION
 from cadam3d.io.reading import opened, unusable
 
-# The first bytes of the unzipped header. Version 4 is not a gzip stream, and begins with them directly.
+# The first bytes of the unzipped header. Version 4 (``gaussforge.py``) begins with them directly.
 MAGIC = b"NGSP"
 GZIP_MAGIC = b"\x1f\x8b\x08"
 HEADER = struct.Struct("<4sIIBBBB")
@@ -108,7 +108,7 @@ def write_spz(path: Path, gaussians: Gaussians, *, up: str) -> None:
             file.write(block.tobytes())
 
 
-def read_spz(path: Path, *, up: str = "+y") -> Gaussians:
+def read_spz(path: Path, *, up: str = "-y") -> Gaussians:
     """Read Gaussians of a file of version 2 or 3 into world axes, on the CPU, as float32.
 
     ``up`` is the up axis of the file. Never allocates more than 20 times the size of the file and 64 MB.
@@ -117,8 +117,6 @@ def read_spz(path: Path, *, up: str = "+y") -> Gaussians:
     require_choice("up", up, UPS)
     with opened(path) as file:
         content = file.read()
-    if content.startswith(MAGIC):
-        raise UserError(f"{path}: expected SPZ version 2 or 3, got version 4 or later. Try: {CONVERSION}")
     inflate = zlib.decompressobj(wbits=31)  # gzip, whose checksum is verified
     try:
         start = inflate.decompress(content, HEADER.size)

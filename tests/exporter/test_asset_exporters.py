@@ -21,7 +21,7 @@ EXPORTERS = {
     "asset.compressed.ply": (CompressedPlyExporter, {}),
     "asset.splat": (SplatExporter, {}),
     "asset.spz": (SpzExporter, {"version": 3}),
-    "asset.glb": (GlbExporter, {}),
+    "asset.glb": (GlbExporter, {"colors": "display"}),
     "asset.sog": (SogExporter, {}),
     "asset.ksplat": (KsplatExporter, {}),
 }

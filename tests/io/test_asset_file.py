@@ -3,10 +3,13 @@
 import pytest
 import torch
 
+from cadam3d.core.console import heard_by
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.asset_file import file_format, read_gaussians
 from cadam3d.io.compressed_ply import write_compressed_ply
+from cadam3d.io.gaussforge import write_ksplat, write_sog, write_spz4
+from cadam3d.io.glb import write_glb
 from cadam3d.io.ply import write_ply
 from cadam3d.io.splat import write_splat
 from cadam3d.io.spz import write_spz
@@ -21,8 +24,30 @@ WRITERS = {
     "compressed ply": (write_compressed_ply, ".ply"),
     "splat": (write_splat, ".splat"),
     "spz": (write_spz, ".spz"),
+    "glb": (write_glb, ".glb"),
+    "sog": (write_sog, ".sog"),
+    "ksplat": (write_ksplat, ".ksplat"),
+    "spz 4": (write_spz4, ".spz"),
 }
-USUAL_UP = {"ply": "-y", "compressed ply": "-y", "splat": "-y", "spz": "+y"}
+FORGED = ("sog", "ksplat", "spz 4")
+
+
+def usual_up(kind: str) -> str:
+    return "+y" if kind == "glb" else "-y"
+
+
+@pytest.fixture(autouse=True)
+def _needs_gaussforge(request):
+    if "kind" in request.fixturenames and request.getfixturevalue("kind") in FORGED:
+        pytest.importorskip("gaussforge")
+
+
+def messages_of(read) -> list[str]:
+    """Return what a call says to the user."""
+    said = []
+    with heard_by(lambda text, _: said.append(text)):
+        read()
+    return said
 
 
 def one_gaussian() -> Gaussians:
@@ -50,7 +75,7 @@ def assert_similar(first: Gaussians, second: Gaussians) -> None:
 def test_every_format_is_found_and_upright_by_default(tmp_path, kind):
     write, suffix = WRITERS[kind]
     path = tmp_path / f"a{suffix}"
-    write(path, one_gaussian(), up=USUAL_UP[kind])
+    write(path, one_gaussian(), up=usual_up(kind))
     if suffix == ".ply":
         without_our_comments(path)
     assert file_format(path) == kind
@@ -78,7 +103,7 @@ def test_the_axes_that_a_file_records_take_precedence(tmp_path, kind):
 @pytest.mark.parametrize("kind", ["ply", "compressed ply", "spz"])
 @pytest.mark.parametrize("name", ["asset", "asset.PLY", "asset.splat"])
 def test_the_content_decides_rather_than_the_name(tmp_path, kind, name):
-    WRITERS[kind][0](tmp_path / name, one_gaussian(), up=USUAL_UP[kind])
+    WRITERS[kind][0](tmp_path / name, one_gaussian(), up=usual_up(kind))
     assert file_format(tmp_path / name) == kind
     assert_similar(read_gaussians(tmp_path / name), one_gaussian())
 
@@ -89,13 +114,10 @@ def test_the_content_decides_rather_than_the_name(tmp_path, kind, name):
         (
             "a.ply",
             b"solid teapot",
-            "not a ply file, nor another one of .ply|.splat|.spz: it begins with b'soli'",
+            "not a ply file, nor another one of .ply|.compressed.ply|.splat|.spz|.glb|.sog|.ksplat:",
         ),
         ("a.ply", b"", "not a ply file"),
-        ("a.glb", b"glTF\2\0\0\0", "expected .ply|.splat|.spz, got glb"),
-        ("a.sog", b"PK\3\4", "expected .ply|.splat|.spz, got .sog"),
-        ("a.ksplat", b"\0\1", "expected .ply|.splat|.spz, got .ksplat"),
-        ("a.spz", b"NGSP\4\0\0\0", "expected SPZ version 2 or 3"),
+        ("a.glb", b"glTF\2\0\0\0", "not a readable glb file"),
         ("a.splat", b"x" * 33, "expected records of 32 bytes, got 33 bytes"),
         ("a.obj", b"v 0 0 0\n", "not a ply file"),
     ],
@@ -106,6 +128,32 @@ def test_any_other_file_is_one_message(tmp_path, name, content, message):
         read_gaussians(tmp_path / name)
     assert str(caught.value).startswith(f"{tmp_path / name}: {message}")
     assert str(caught.value).count("Try: ") == 1
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_a_file_that_does_not_record_its_axes_is_read_with_one_line_about_the_assumption(tmp_path, kind):
+    write, suffix = WRITERS[kind]
+    path = tmp_path / f"a{suffix}"
+    write(path, one_gaussian(), up=usual_up(kind))
+    if suffix == ".ply":
+        assert not messages_of(lambda: read_gaussians(path))
+        without_our_comments(path)
+    note = "Note: {} does not record its axes, so it is read as -y up. If it is upside down: here=+y"
+    notes = [] if kind == "glb" else [note.format(path.name)]
+    assert messages_of(lambda: read_gaussians(path, key="here")) == notes
+    assert not messages_of(lambda: read_gaussians(path, up="-y"))
+
+
+@pytest.mark.parametrize("kind", FORGED)
+def test_a_damaged_file_is_one_message_that_names_it(tmp_path, kind):
+    write, suffix = WRITERS[kind]
+    path = tmp_path / f"a{suffix}"
+    write(path, one_gaussian(), up="-y")
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(UserError) as caught:
+        read_gaussians(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
 
 
 def test_an_unknown_axis_is_refused(tmp_path):

@@ -18,8 +18,8 @@ from formats import (
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io import gltf
-from cadam3d.io.frames import UPS, file_to_world
-from cadam3d.io.glb import write_glb
+from cadam3d.io.frames import UPS, file_to_world, turned
+from cadam3d.io.glb import read_glb, write_glb
 
 NAMESPACE = "KHR_gaussian_splatting:"
 COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
@@ -161,3 +161,91 @@ def test_a_file_beyond_the_limit_of_the_format_is_one_message(tmp_path, monkeypa
     with pytest.raises(UserError, match=r"less than 4 GB, got .*Try: 'exporter=\[ply\]'$"):
         write_glb(tmp_path / "a.glb", random_gaussians(30), up="+y")
     assert not list(tmp_path.iterdir())
+
+
+# Reading
+
+
+def edited(path, change) -> None:
+    """Change the JSON of a file in place."""
+    content = path.read_bytes()
+    length = struct.unpack_from("<I", content, 12)[0]
+    document = json.loads(content[20 : 20 + length])
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    path.write_bytes(content[:12] + struct.pack("<I4s", len(text), b"JSON") + text + content[20 + length :])
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("up", UPS)
+def test_what_is_written_is_read(tmp_path, degree, up):
+    gaussians = random_gaussians(30, degree)
+    write_glb(tmp_path / "a.glb", gaussians, up=up)
+    back = errors(read_glb(tmp_path / "a.glb", up=up), gaussians)
+    assert max(back.values()) < 1e-4
+
+
+def test_linear_colours_are_linear_light_and_are_read_back(tmp_path):
+    gaussians = asset(3)
+    write_glb(tmp_path / "a.glb", gaussians, up="+y", colors="linear")
+    assert likeness_db(read_glb(tmp_path / "a.glb"), 3) > 40
+    document, arrays = parsed((tmp_path / "a.glb").read_bytes())
+    space = document["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]["colorSpace"]
+    assert space == "lin_rec709_display"
+    flat = random_gaussians(30, 0)
+    write_glb(tmp_path / "a.glb", flat, up="+y", colors="linear")
+    assert errors(read_glb(tmp_path / "a.glb"), flat)["sh0"] < 1e-4
+    _, arrays = parsed((tmp_path / "a.glb").read_bytes())
+    shown = 0.5 + SH_C0 * flat.sh[:, 0].double().numpy()
+    light = 0.5 + SH_C0 * arrays[f"{NAMESPACE}SH_DEGREE_0_COEF_0"]
+    assert np.allclose(light, gltf.linear(shown), atol=1e-5)
+
+
+def test_nodes_turn_scale_and_move_their_gaussians(tmp_path):
+    gaussians = random_gaussians(30, 3)
+    write_glb(tmp_path / "a.glb", gaussians, up="+y")
+    half = 0.5**0.5
+
+    def change(document):
+        document["nodes"] = [
+            {"children": [1], "scale": [2, 2, 2]},
+            {"mesh": 0, "rotation": [0, half, 0, half]},
+        ]
+        document["nodes"][1]["translation"] = [0, 3, 0]
+
+    edited(tmp_path / "a.glb", change)
+    # A quarter turn about the y axis of the file is one about the z axis of the world.
+    wanted = turned(gaussians, 90)
+    found = read_glb(tmp_path / "a.glb")
+    torch.testing.assert_close(found.means, 2 * (wanted.means + torch.tensor([0.0, 0.0, 3.0])))
+    # ``turned`` renames the axes of each Gaussian too, which leaves its covariance as it is.
+    axes = [each.rotations * each.scales[:, None] for each in (found, wanted)]
+    torch.testing.assert_close(axes[0] @ axes[0].mT, 4 * axes[1] @ axes[1].mT, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(found.sh, wanted.sh, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d["nodes"][0].update(scale=[1, 2, 1]), "mirrors or distorts"),
+        (lambda d: d["nodes"][0].update(scale=[-1, 1, 1]), "mirrors or distorts"),
+        (lambda d: d["nodes"][0].update(children=[0]), "no tree"),
+        (lambda d: d["accessors"][0].update(count=1 << 40), "not a readable glb"),
+        (lambda d: d["bufferViews"][0].update(byteStride=0), "another kind"),
+        (lambda d: d["bufferViews"][0].update(byteOffset=-4), "another kind"),
+        (lambda d: d.update(meshes=None), "not a readable glb"),
+        (lambda d: d["meshes"][0]["primitives"][0].pop("extensions"), "such as a mesh"),
+        (
+            lambda d: (d["meshes"][0]["primitives"][0].pop("extensions"), d.pop("extensionsUsed")),
+            "such as a mesh",
+        ),
+    ],
+)
+def test_a_file_that_does_not_describe_gaussians_is_one_message(tmp_path, change, message):
+    path = tmp_path / "a.glb"
+    write_glb(path, random_gaussians(3, 1), up="+y")
+    edited(path, change)
+    with pytest.raises(UserError, match=message) as caught:
+        read_glb(path)
+    assert str(caught.value).startswith(f"{path}: ")

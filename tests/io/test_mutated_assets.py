@@ -25,6 +25,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.asset_file import read_gaussians
 from cadam3d.io.compressed_ply import read_compressed_ply, write_compressed_ply
+from cadam3d.io.glb import read_glb, write_glb
 from cadam3d.io.ply import read_ply, read_points, write_ply
 from cadam3d.io.ply_tables import read_header
 from cadam3d.io.splat import read_splat, write_splat
@@ -109,6 +110,7 @@ READERS: dict[str, tuple[Callable[[Path], Gaussians], str]] = {
     "compressed ply": (read_compressed_ply, "a.ply"),
     "old compressed ply": (read_compressed_ply, "a.compressed.ply"),
     "splat": (read_splat, "a.splat"),
+    "glb": (read_glb, "a.glb"),
     "spz": (read_spz, "a.spz"),
     "spz 2": (read_spz, "a.spz"),
     "points": (read_cloud, "a.ply"),
@@ -130,6 +132,7 @@ def samples(tmp_path_factory) -> dict[str, bytes]:
         "compressed ply": written(write_compressed_ply, 1, "b.ply", folder, n=300),
         "old compressed ply": without_color_bounds(written(write_compressed_ply, 0, "c.ply", folder)),
         "splat": written(write_splat, 0, "a.splat", folder),
+        "glb": written(write_glb, 1, "a.glb", folder),
         "spz": written(write_spz, 1, "a.spz", folder),
         "spz 2": of_version_2(written(write_spz, 0, "b.spz", folder)),
         "points": plain_ply(points | colors, "ascii"),
