@@ -1,7 +1,9 @@
 """Mesh: Gaussians on the surface of a mesh file, with its colours."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,8 +11,10 @@ import torch
 import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
+from trimesh.resolvers import FilePathResolver
 
 from cadam3d.core.checks import require_choice, require_color
+from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.points import (
@@ -23,6 +27,7 @@ from cadam3d.initializer.points import (
 )
 from cadam3d.io.frames import points_to_world, turned_points
 from cadam3d.io.gltf import linear, srgb
+from cadam3d.io.reading import read_bytes
 
 UPS = ("z", "y")
 # Other formats of trimesh may refer to files elsewhere, or run other programs.
@@ -30,6 +35,7 @@ SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 # Vertex colours are linear in these files, and textures are sRGB (glTF 2.0, sec. 3.9.2). Other
 # formats have sRGB colours only.
 LINEAR_SUFFIXES = (".glb", ".gltf")
+LARGEST_FILE = 1 << 30  # bytes of a material, a buffer or a picture that a mesh names
 # Linear colours of vertices, among the attributes of a part.
 VERTEX_LIGHT = "vertex light"
 
@@ -69,9 +75,10 @@ class Mesh(FromObject):
     def _load(self) -> list[trimesh.Trimesh]:
         """Return the surfaces of the file, each at its place in the scene and with its own colours."""
         path = found_file(self.path)
+        nearby = _NearbyFiles(str(path))
         # Every format has its own parser, with its own exceptions.
         try:
-            scene = trimesh.load_scene(path)
+            scene = trimesh.load_scene(path, resolver=nearby)
             if path.suffix.lower() in LINEAR_SUFFIXES:
                 for geometry in scene.geometry.values():
                     _keep_vertex_light(geometry)
@@ -81,6 +88,11 @@ class Mesh(FromObject):
                 f"initializer.path: expected a file with a mesh ({', '.join(SUFFIXES)}), got {self.path!r}, "
                 f"which cannot be read ({str(error) or type(error).__name__})."
             ) from error
+        visuals: list[Any] = [part.visual for part in parts]
+        is_lost = any(each.kind == "texture" and not _has_picture(each) for each in visuals)
+        if is_lost and not all(name.lower().endswith(".mtl") for name in nearby.asked):
+            reason = "has no texture that can be read, so it has the colours of its materials"
+            say(f"Note: {path.name} {reason}", logging.WARNING)
         is_finite = all(np.isfinite(part.vertices).all() for part in parts)
         if not is_finite or sum(float(part.area) for part in parts) <= 0:
             raise UserError(
@@ -102,6 +114,31 @@ class Mesh(FromObject):
                 rgb[is_here] = torch.as_tensor(colors[:, :3] / 255.0, dtype=torch.float32)
             first += len(part.faces)
         return rgb
+
+
+class _NearbyFiles(FilePathResolver):
+    """Reads the files that a mesh names, if they are regular files in its folder, and remembers the names."""
+
+    def __init__(self, source: str) -> None:
+        super().__init__(source)
+        self.asked: list[str] = []
+
+    def get(self, name: str) -> bytes:
+        """Return the content of the file ``name``. Raises ``UserError`` if it cannot be read."""
+        self.asked.append(name)
+        return read_bytes(self.absolute(name), largest=LARGEST_FILE)
+
+    def namespaced(self, namespace: str) -> "_NearbyFiles":
+        return _NearbyFiles(str(Path(self.parent, namespace)))
+
+
+def _has_picture(visual: Any) -> bool:
+    """Return whether a texture without vertex colours has a picture that can be decoded."""
+    picture = getattr(visual.material, "image", None) or getattr(visual.material, "baseColorTexture", None)
+    try:
+        return picture is not None and picture.load() is not None
+    except (OSError, ValueError, SyntaxError):  # what Pillow raises for a damaged picture
+        return False
 
 
 def _keep_vertex_light(geometry: Any) -> None:
@@ -137,7 +174,7 @@ def _colors_of(part: trimesh.Trimesh, faces: np.ndarray, barycentric: np.ndarray
         return (barycentric * visual.vertex_colors[rows]).sum(axis=1)
     if visual.kind == "face":
         return visual.face_colors[faces]
-    if visual.kind == "texture" and visual.uv is not None:
+    if visual.kind == "texture" and visual.uv is not None and _has_picture(visual):
         return np.asarray(visual.material.to_color((barycentric * visual.uv[rows]).sum(axis=1)))
     if visual.kind == "texture":
         return np.tile(visual.material.main_color, (len(faces), 1))

@@ -1,5 +1,8 @@
 """Laws of the mesh initializer."""
 
+import json
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -243,3 +246,40 @@ def test_a_file_without_a_surface_is_reported(tmp_path, kind):
         trimesh.Trimesh(line, [[0, 1, 2]], process=False).export(tmp_path / "it.ply")
     with pytest.raises(UserError, match=r"expected a mesh with triangles, got .*, which has no surface"):
         build(tmp_path / "it.ply")
+
+
+def textured_quad(folder, map_kd: str = "map_Kd skin.png", mtllib: str = "a.mtl"):
+    """Write a square as an obj with texture coordinates and a red material, and return its path."""
+    corners = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+    (folder / "a.mtl").write_text(f"newmtl skin\nKd 1 0 0\n{map_kd}\n")
+    (folder / "a.obj").write_text(f"mtllib {mtllib}\n{corners}usemtl skin\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n")
+    return folder / "a.obj"
+
+
+@pytest.mark.parametrize("picture", [None, b"", b"no picture", b"\x89PNG\r\n\x1a\n" + b"\0" * 20])
+def test_an_obj_without_its_texture_has_the_color_of_its_material_and_a_note_says_so(
+    tmp_path, capsys, picture
+):
+    if picture is not None:
+        (tmp_path / "skin.png").write_bytes(picture)
+    made = build(textured_quad(tmp_path), count=50)
+    torch.testing.assert_close(rgb(made), torch.tensor([1.0, 0.0, 0.0]).expand(50, 3), atol=1e-5, rtol=0)
+    assert capsys.readouterr().err.count("Note: a.obj has no texture that can be read") == 1
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+@pytest.mark.parametrize("place", ["map_Kd", "mtllib", "gltf buffer"])
+def test_a_named_pipe_in_place_of_a_file_does_not_hang(tmp_path, place):
+    os.mkfifo(tmp_path / "pipe")
+    if place == "map_Kd":
+        assert len(build(textured_quad(tmp_path, map_kd="map_Kd pipe"), count=5)) == 5
+    elif place == "mtllib":
+        assert len(build(textured_quad(tmp_path, mtllib="pipe"), count=5)) == 5
+    else:
+        path = tmp_path / "a.gltf"
+        trimesh.creation.box().export(path)
+        document = json.loads(path.read_text())
+        document["buffers"][0]["uri"] = "pipe"
+        path.write_text(json.dumps(document))
+        with pytest.raises(UserError, match="cannot be read"):
+            build(path)
