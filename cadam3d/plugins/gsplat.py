@@ -148,6 +148,14 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
             return None
         if observer is None:
             observer = _Observer(optimizer, step)
+            # Trainers count their steps from 0 or from 1.
+            if step > 1 and state["age"] is None:
+                warnings.warn(
+                    f"CAdamStrategy starts at step {step} without moments of earlier steps, so other "
+                    "Gaussians grow than in a run without a break. If the trainer resumes, save the state "
+                    "of the strategy with the parameters, and load it too.",
+                    stacklevel=3,
+                )
         observer.strategy, observer.state = self, state
         observer.is_stepping = False
         # A state that was loaded from a file may be on another device.

@@ -396,7 +396,7 @@ def run(toy: Toy, first: int, last: int) -> None:
         toy.step(step, noise(1, len(toy.params["means"]), seed=step)[0])
 
 
-def test_a_run_that_is_saved_and_loaded_continues_to_the_bit():
+def test_a_run_that_is_saved_and_loaded_continues_to_the_bit(recwarn):
     whole, saved, loaded = (Toy(CAdamStrategy(**SHORT, **YOUNG), kind=torch.optim.Adam) for _ in range(3))
     run(whole, 0, 18)
     run(saved, 0, 10)
@@ -411,6 +411,7 @@ def test_a_run_that_is_saved_and_loaded_continues_to_the_bit():
         loaded.optimizers[name].load_state_dict(optimizer)
     loaded.state = payload["state"]
     run(loaded, 10, 18)
+    assert not recwarn
     assert len(loaded.params["means"]) == len(whole.params["means"]) != len(saved.params["means"])
     for name in ("m", "v", "age"):
         torch.testing.assert_close(loaded.state[name], whole.state[name], **EXACT)
@@ -517,6 +518,13 @@ def test_the_settings_of_default_strategy_keep_their_names_and_defaults():
 def test_a_wrong_setting_is_named(settings, message):
     with pytest.raises(UserError, match=message):
         CAdamStrategy(**settings)
+
+
+def test_a_trainer_that_resumes_without_the_state_is_warned(recwarn):
+    run(Toy(CAdamStrategy(**SHORT, **YOUNG)), 1, 6)
+    assert not recwarn
+    with pytest.warns(UserWarning, match="starts at step 6 without moments of earlier steps"):
+        run(Toy(CAdamStrategy(**SHORT, **YOUNG)), 6, 8)
 
 
 def test_a_trainer_that_steps_other_optimizers_is_stopped_at_the_first_refinement():
