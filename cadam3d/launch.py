@@ -23,7 +23,6 @@ from cadam3d.settings.line import HYDRA_KEYS, OF_SWEEPS, Line, key_of, quoted, r
 from cadam3d.settings.options import with_example
 from cadam3d.sweep.plan import require_attempts
 
-TRAINING = ("train", "sweep")  # the commands that have a run folder
 EXPORTING = ("render", "export")  # the commands with output=
 
 
@@ -34,13 +33,13 @@ def launch(command: str, words: Sequence[str]) -> int:
     """
     with explaining(command, words):
         line = read_line(command, words)
-        if line.wants_page:
+        if line.options.help or line.options.cfg:
             _show_page(line)
             return 0
-        if line.is_sweep:
+        if command == "sweep":
             from cadam3d.commands import sweep
 
-            return sweep.run(command, line.overrides, line.flags, line.options)
+            return sweep.run(line.overrides, line.flags, line.options)
         cfg = _composed(line)
         if cfg.get("attempts", 1) > 1:
             from cadam3d.commands import attempts
@@ -51,7 +50,7 @@ def launch(command: str, words: Sequence[str]) -> int:
     # Imported modules stay in memory, so the garbage collector need not scan them.
     gc.freeze()
     gc.enable()
-    with completing(words):
+    with completing():
         return module.run(cfg, call) or 0
 
 
@@ -64,7 +63,7 @@ def prepare(command: str, words: Sequence[str]) -> tuple[DictConfig, Call]:
     with explaining(command, words):
         line = read_line(command, words)
         shell = f"in a shell: {shlex.join(['cadam3d', command, *words])}"
-        is_single = not (line.is_sweep or line.wants_page)
+        is_single = not (command == "sweep" or line.options.help or line.options.cfg)
         require(is_single, command, expected="a single run without a page", got=line.words, example=shell)
         cfg = _composed(line)
         attempts = cfg.get("attempts", 1)
@@ -73,7 +72,7 @@ def prepare(command: str, words: Sequence[str]) -> tuple[DictConfig, Call]:
 
 
 @contextmanager
-def completing(words: Sequence[str]) -> Iterator[None]:
+def completing() -> Iterator[None]:
     """Add an example to a mistake of the user that a running command finds; a bug keeps its traceback."""
     try:
         yield
@@ -91,7 +90,7 @@ def completing(words: Sequence[str]) -> Iterator[None]:
 def explaining(command: str, words: Sequence[str]) -> Iterator[None]:
     """Translate the exceptions of Hydra and OmegaConf into ``UserError``, here and nowhere else."""
     try:
-        with completing(words):
+        with completing():
             yield
     except Exception as error:
         # The clean-up of OmegaConf can raise after an interrupt.
@@ -115,10 +114,18 @@ def read_line(command: str, words: Sequence[str]) -> Line:
     line = Line(command, words=typed, overrides=typed, flags=flags, options=options)
     if options.help:
         return line
-    _refuse_words(line)
-    overrides = [quoted(override, is_sweep=line.is_sweep) for override in typed]
-    if command in TRAINING:
-        overrides = resumed(overrides, is_sweep=line.is_sweep, folders=line.folders, retry=line.trusting)
+    for word in typed:
+        key, example = key_of(word), f"cadam3d {command} --help"
+        is_override = "=" in word or word.startswith("~")
+        expected = "key=value, in quotes if it has spaces"
+        require(is_override, repr(word), expected=expected, got=word, example=example)
+        if re.split(r"[./]", key)[0] == "hydra" and not HYDRA_KEYS.match(key):
+            raise UserError(f"{key}: cadam3d has no such setting of Hydra. Try: {RUN_FOLDER}=outputs/mine")
+    is_sweep = command == "sweep"
+    overrides = [quoted(override, is_sweep=is_sweep) for override in typed]
+    if is_sweep or command == "train":
+        retry = shlex.join(["cadam3d", command, *words, "trust=true"])
+        overrides = resumed(overrides, is_sweep=is_sweep, folders=line.folders, retry=retry)
     elif command in EXPORTING:
         # The exporters load torch.
         from cadam3d.settings.output import exporting
@@ -128,16 +135,15 @@ def read_line(command: str, words: Sequence[str]) -> Line:
 
 
 def _show_page(line: Line) -> None:
-    """Print a page: our help, the settings, or one of the pages about Hydra."""
+    """Print a page: our help, or the settings."""
     if line.options.help:
         show(help_text(line.command, line.overrides, line.folders))
-    elif line.is_sweep and line.options.cfg:
+    elif line.command == "sweep":
         from cadam3d.sweep.plan import read_sweep
 
         # The page of a sweep shows the settings of its first job.
-        sweep = read_sweep(line.command, line.overrides, line.options)
-        flags = [flag for flag in line.flags if flag not in ("-m", "--multirun")]
-        run_hydra("sweep", [*sweep.parts.own, *sweep.jobs[0].overrides, *flags])
+        sweep = read_sweep(line.overrides, line.options)
+        run_hydra("sweep", [*sweep.parts.own, *sweep.jobs[0].overrides, *line.flags])
     else:
         run_hydra(line.command, [*line.overrides, *line.flags])
 
@@ -176,17 +182,3 @@ def _call(line: Line, cfg: DictConfig) -> Call:
             folder=expanded(str(text)).absolute(),
             has_chosen_folder=any(key_of(override) == RUN_FOLDER for override in line.overrides),
         )
-
-
-def _refuse_words(line: Line) -> None:
-    """Refuse overrides that no command accepts, and a sweep of a command that cannot be swept."""
-    command = line.command
-    for word in line.words:
-        key = key_of(word)
-        is_override = "=" in word or word.startswith("~")
-        expected = "key=value, in quotes if it has spaces"
-        require(is_override, repr(word), expected=expected, got=word, example=f"cadam3d {command} --help")
-        if re.split(r"[./]", key)[0] == "hydra" and not HYDRA_KEYS.match(key):
-            raise UserError(f"{key}: cadam3d has no such setting of Hydra. Try: {RUN_FOLDER}=outputs/mine")
-    if line.is_sweep and command not in TRAINING:
-        raise UserError(f"{command}: only training can be swept. Try: cadam3d {command} --help")

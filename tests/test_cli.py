@@ -396,7 +396,7 @@ def test_resume_stays_in_its_folder_and_out_of_sweeps(run_folder, type_line):
         "expected the folder of the resumed run"
         in type_line("train", f"resume={run_folder}", "hydra.run.dir=other").message
     )
-    assert "not a sweep" in type_line("train", "-m", f"resume={run_folder}", "seed=0,1").message
+    assert "not a sweep" in type_line("sweep", f"resume={run_folder}", "seed=0,1").message
 
 
 @pytest.mark.parametrize(
@@ -548,9 +548,9 @@ def test_the_overrides_of_a_run_are_recorded_without_those_of_hydra(type_line, j
 
 
 def test_flags_may_be_anywhere_in_a_line():
-    words = ["a=1", "-m", "b=2", "--cfg", "job", "c=3"]
+    words = ["a=1", "--resolve", "b=2", "--cfg", "job", "c=3"]
     options, overrides = read_flags(words)
-    assert (overrides, options.multirun, options.cfg) == (["a=1", "b=2", "c=3"], True, "job")
+    assert (overrides, options.resolve, options.cfg) == (["a=1", "b=2", "c=3"], True, "job")
 
 
 def test_a_wrong_setting_of_a_launcher_is_refused_before_a_sweep_starts(type_line):

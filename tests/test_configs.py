@@ -278,7 +278,7 @@ def test_every_arm_of_a_grid_composes(grid, monkeypatch):
     named = yaml.safe_load(text).get("prompts")
     line += [] if "prompt" in axes else ["prompts.first=1" if named else PROMPT]
     of_set = len(read_prompts(named)) if named else 1
-    sweep = read_sweep("sweep", line, NO_FLAGS)
+    sweep = read_sweep(line, NO_FLAGS)
     assert len(sweep.jobs) > 1
     claimed = re.search(r": ([\d,]+) jobs", text)
     counted = len(sweep.jobs) * math.prod(len(values) for values in axes.values()) * of_set

@@ -171,7 +171,7 @@ class Asset:
         place = os.fspath(path)
         require_free(overrides, {"output": place, "run": self, "ply": self})
         words = [literal("output", place), *overrides]
-        with as_guest(), completing(words):
+        with as_guest(), completing():
             cfg, _ = prepare("export", words)
             source = self.source or Path("asset")
             set_title(cfg, self.title)

@@ -143,7 +143,7 @@ def compose(  # noqa: PLR0913  (one argument per component)
             raise UserError(
                 'resume: only a whole run continues another. Try: cadam3d.train(None, "resume=RUN")'
             )
-    with as_guest(), completing(overrides):
+    with as_guest(), completing():
         cfg, _ = prepare("train", overrides)
         device = resolve_device(cfg.device)
         require_whole("seed", cfg.seed, low=0)

@@ -106,7 +106,7 @@ def train(
     # Python handles signals in the main thread only.
     is_main = threading.current_thread() is threading.main_thread()
     stop = StopOnSignal((signal.SIGINT,) if is_main else ())
-    with as_guest(), completing(words):
+    with as_guest(), completing():
         cfg, call = prepare("train", words)
         folder, _ = optimise(cfg, call, stop, callbacks)
     run = Run(folder)

@@ -12,9 +12,9 @@ from cadam3d.sweep.plan import read_sweep
 from cadam3d.sweep.start import run_sweep
 
 
-def run(command: str, overrides: Sequence[str], flags: Sequence[str], options: Namespace) -> int:
+def run(overrides: Sequence[str], flags: Sequence[str], options: Namespace) -> int:
     """Run the sweep of a line and report on it. Return 0 if every job has a result, or after a dry run."""
-    ended = run_sweep(read_sweep(command, overrides, options), overrides, flags)
+    ended = run_sweep(read_sweep(overrides, options), overrides, flags)
     if not (ended.was_stopped or ended.was_dry):
         write_report(ended.folder)
     return ended.code

@@ -1,6 +1,5 @@
 """Compose: read the YAML files and apply the overrides of a command line, as Hydra does."""
 
-import math
 import os
 import re
 import sys
@@ -8,6 +7,7 @@ import unicodedata
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -62,19 +62,16 @@ def compose(
 ) -> DictConfig:
     """Return the configuration that ``cadam3d <config_name> <overrides>`` would run with.
 
-    The ``flags`` of a line can name another configuration and one more folder of YAML files; with them,
-    Hydra's own node is kept. Raises Hydra's exceptions, which ``cadam3d.settings.advice`` explains.
+    The ``flags`` of a line can name one more folder of YAML files; with them, Hydra's own node is kept.
+    Raises Hydra's exceptions, which ``cadam3d.settings.advice`` explains.
     """
     register_resolvers()
-    words, name, place = list(overrides), config_name, "configuration"
-    if flags is not None:
-        name = flags.config_name or name
+    words, place = list(overrides), "configuration"
     if flags is not None and flags.config_dir is not None:
         place, folder = "--config-dir", Path(flags.config_dir)
         require(folder.is_dir(), place, expected="a folder", got=flags.config_dir, example=f"{place}=.")
         typed = [word for word in words if word.startswith(f"{SEARCH_PATH}=")]
-        values: list[Any] = [OverridesParser.create().parse_override(word).value() for word in typed]
-        more = [path for value in values for path in value]
+        more = [path for word in typed for path in value_of(word)]
         folders = ",".join(map(quote, [f"file://{folder.absolute()}", *more]))
         words = [*(word for word in words if word not in typed), f"{SEARCH_PATH}=[{folders}]"]
     # The calling program may use Hydra itself.
@@ -83,7 +80,7 @@ def compose(
     try:
         job = JobRuntime.instance().get("name")
         with hydra.initialize_config_dir(str(config_dir().resolve()), job, VERSION_BASE):
-            cfg = hydra.compose(name, words, return_hydra_config=True)
+            cfg = hydra.compose(config_name, words, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, UserError):
         raise
     # A wrong YAML file, or a deeply nested value, raises an exception of a parser, of a codec or of Python.
@@ -149,7 +146,7 @@ def register_resolvers() -> None:
 
     It is safe to call this again.
     """
-    for function in (copies, parts, slug, span):
+    for function in (parts, slug, span):
         OmegaConf.register_new_resolver(f"cadam3d.{function.__name__}", function, replace=True)
 
 
@@ -161,15 +158,6 @@ def parts(count: int, pieces: int, steps: object, least: int = 1) -> int:
     ``steps``.
     """
     return max(least, count * max(1, steps // pieces)) if type(steps) is int else count
-
-
-def copies(count: object, times: object, usual: int) -> int:
-    """Return ``count`` times ``times``; ``usual`` replaces a count that is null.
-
-    A factor that is not an integer counts as 1; the component that owns the key reports the error.
-    """
-    numbers = [usual if count is None else count, times]
-    return math.prod(number if type(number) is int else 1 for number in numbers)
 
 
 def span(share: float, start: object, *ends: object) -> int:
@@ -187,6 +175,12 @@ def slug(*parts: object) -> str:
     text = unicodedata.normalize("NFKC", " ".join(str(part) for part in parts))
     text = re.sub(r"(?:[^\w.=]|(?<!\w)=)+", "-", text).strip("-.")
     return text[:SLUG_LENGTH].rstrip("-.") or "untitled"
+
+
+@cache  # the jobs of a sweep repeat their overrides
+def value_of(override: str) -> Any:
+    """Return the value of an override as Hydra reads it."""
+    return OverridesParser.create().parse_override(override).value()
 
 
 def escape(text: str) -> str:

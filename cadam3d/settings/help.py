@@ -239,10 +239,8 @@ def _overview(library: Library, command: str, groups: dict[str, Choices]) -> lis
     about = library.command(command)
     parts = [_wrapped(about.about), f"Settings (key=value):\n{_table(map(_row, about.settings))}"]
     if groups:
-        parts.append(
-            _wrapped("Parts (group=option, or 'group=[one,two]'). * marks what is chosen by default.")
-        )
-        parts += [_group(library, group) for group in groups.values()]
+        intro = _wrapped("Parts (group=option, or 'group=[one,two]'). * marks what is chosen by default.")
+        parts += [intro, *(_group(library, group) for group in groups.values())]
         example = next(f"{group.name}={group.chosen[0]}" for group in groups.values() if group.chosen)
         parts.append(_wrapped(f"More: cadam3d {command} --help {example}, or cadam3d {command} --cfg job."))
     return parts
@@ -288,10 +286,9 @@ def _table(rows: Iterable[tuple[str, str]]) -> str:
 
 def _wrapped(text: str) -> str:
     """Return a text in lines of the terminal, except those that begin with a space; words stay whole."""
-    lines = text.splitlines()
     return "\n".join(
         line if line.startswith(" ") else textwrap.fill(line, _width(), break_on_hyphens=False)
-        for line in lines
+        for line in text.splitlines()
     )
 
 

@@ -3,18 +3,16 @@
 import argparse
 import os
 import re
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import LATEST, OVERRIDES, RUN_FOLDER, has_file, setting_word, typed_path
-from cadam3d.settings.compose import TEXT_KEYS, quote
+from cadam3d.settings.compose import TEXT_KEYS, quote, value_of
 from cadam3d.settings.options import config_dir
 from cadam3d.settings.trust import is_trusted, judge_overrides, read_overrides, require_contained
 
@@ -22,10 +20,8 @@ SWEEP_FOLDER = "hydra.sweep.dir"
 # Values of these keys are quoted: paths, and a text that may be null.
 PATH_KEYS = (
     *("run", "ply", "output", "resume", RUN_FOLDER, SWEEP_FOLDER),
-    *("initializer.path", "initializer.prompt", "rasterizer.cache_dir"),
-    *("runs", "answers", "key", "consent"),
-    *("prompts", "prompts.file", "prompts.category"),
-    "prompts.shard",
+    *("initializer.path", "initializer.prompt", "rasterizer.cache_dir", "runs", "answers", "key", "consent"),
+    *("prompts", "prompts.file", "prompts.category", "prompts.shard"),
 )
 # Whether the jobs of a sweep are only listed, and where they run. No run has these settings.
 DRY_RUN = "dry_run"
@@ -43,7 +39,7 @@ SWEEP_CALL = re.compile(r"(choice|range|interval|glob|sort|shuffle|tag)\(.*\)", 
 SEPARATOR = r",(?!\s|$)"
 # The settings of Hydra that have an effect.
 HYDRA_KEYS = re.compile(
-    r"hydra\.(run\.dir|sweep\.dir|sweep\.subdir|searchpath|mode)$|hydra[./](launcher|sweeper)\b"
+    r"hydra\.(run\.dir|sweep\.dir|sweep\.subdir|searchpath)$|hydra[./](launcher|sweeper)\b"
 )
 
 
@@ -58,48 +54,27 @@ class Line:
     options: argparse.Namespace  # the flags, parsed
 
     @property
-    def is_sweep(self) -> bool:
-        """Return whether the line asks for many runs."""
-        return self.command == "sweep" or self.options.multirun or "hydra.mode=MULTIRUN" in self.words
-
-    @property
     def folders(self) -> list[Path]:
         """Return the folders of YAML files, in the order in which Hydra searches them."""
         return [Path(self.options.config_dir), config_dir()] if self.options.config_dir else [config_dir()]
-
-    @property
-    def trusting(self) -> str:
-        """Return what to type to trust the folder of a resumed run."""
-        return shlex.join(["cadam3d", self.command, *self.words, *self.flags, "trust=true"])
-
-    @property
-    def wants_page(self) -> bool:
-        """Return whether the line asks for a page, and not for work."""
-        options = self.options
-        return any((options.help, options.cfg, options.hydra_help, options.info))
 
 
 def read_flags(words: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
     """Return the flags of a line, which may be anywhere in it, and its other words, the overrides.
 
-    The flags are those of Hydra that are useful here. Raises ``UserError`` for unknown and conflicting ones.
+    The flags are those of Hydra that are useful here. Raises ``UserError`` for unknown ones.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    for names in ("--help -h", "--hydra-help", "--multirun -m", "--resolve"):
-        parser.add_argument(*names.split(), action="store_true")
-    for names in ("--package -p", "--config-name -cn", "--config-dir -cd"):
-        parser.add_argument(*names.split())
+    parser.add_argument("--help", "-h", action="store_true")
+    parser.add_argument("--resolve", action="store_true")
+    parser.add_argument("--config-dir", "-cd")
     parser.add_argument("--cfg", "-c", choices=("job", "hydra", "all"))
-    pages = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
-    parser.add_argument("--info", "-i", nargs="?", const="all", choices=pages)
     try:
         options, overrides = parser.parse_known_args(words)
     except argparse.ArgumentError as error:
         raise UserError(f"{error}. Try: cadam3d --help") from error
     if unknown := [word for word in overrides if word.startswith("-")]:
         raise UserError(f"{unknown[0]}: no such flag. Try: cadam3d --help")
-    if sum(map(bool, (options.multirun and not options.cfg, options.cfg, options.info))) > 1:
-        raise UserError("--multirun, --cfg, --info: these flags cannot be combined. Try: cadam3d --help")
     return options, overrides
 
 
@@ -110,7 +85,7 @@ def key_of(override: str) -> str:
 
 def text_of(override: str) -> str:
     """Return the value of an override as plain text."""
-    value = OverridesParser.create().parse_override(override).value()
+    value = value_of(override)
     return OmegaConf.create({"value": value}).value if isinstance(value, str) else str(value or "null")
 
 

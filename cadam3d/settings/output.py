@@ -3,11 +3,10 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-
 from cadam3d.core.checks import fail
 from cadam3d.exporter.base import Exporter, exporters_by_suffix
 from cadam3d.io.run_folder import expanded, setting_word
+from cadam3d.settings.compose import value_of
 from cadam3d.settings.line import is_list, key_of, text_of
 from cadam3d.settings.options import option_class, option_names
 
@@ -40,7 +39,9 @@ def exporting(overrides: Sequence[str], folders: Sequence[Path] = ()) -> list[st
     if suffix not in by_suffix and not named and "exporter" not in given:
         expected = f"a file with suffix {'|'.join(by_suffix)}, or a folder"
         raise fail("output", expected=expected, got=name, example=setting_word("output", f"{name}/"))
-    named |= _options(given["exporter"]) if "exporter" in given else set()
+    if "exporter" in given:
+        value = value_of(given["exporter"])
+        named |= set(map(str, value if isinstance(value, list) else [value]))
     chosen = next((each for each in by_suffix.get(suffix, []) if named <= {each}), None)
     if chosen is None or given.get("exporter", "").endswith("=[]"):
         return list(overrides)
@@ -67,9 +68,3 @@ def suffix_of(name: str, known: Mapping[str, object]) -> str:
     name = Path(name).name.lower()
     found = [suffix for suffix in known if name.endswith(suffix) and name != suffix]
     return max(found, key=len, default=Path(name).suffix)
-
-
-def _options(override: str) -> set[str]:
-    """Return the options that an override chooses."""
-    value = OverridesParser.create().parse_override(override).value()
-    return set(map(str, value)) if isinstance(value, list) else {str(value)}

@@ -5,11 +5,9 @@ from argparse import Namespace
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
@@ -18,7 +16,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import RUN_FOLDER, typed_path
 from cadam3d.settings.advice import explain
 from cadam3d.settings.check import require_effective, require_settings
-from cadam3d.settings.compose import compose, flatten
+from cadam3d.settings.compose import compose, flatten, value_of
 from cadam3d.settings.line import DRY_RUN, LAUNCHER_KEY, SWEEP_FOLDER, key_of
 from cadam3d.settings.options import with_example
 from cadam3d.sweep.folder import Job
@@ -160,7 +158,7 @@ class Composer:
         lines = {key_of(line): line for line in overrides if self._may_be_value(line)}
         while not lines.keys() <= (base := self._base_without(lines.values(), overrides)).plain.keys():
             lines = {key: line for key, line in lines.items() if key in base.plain}
-        composed = base.composed({key: _value(line) for key, line in lines.items()})
+        composed = base.composed({key: value_of(line) for key, line in lines.items()})
         require_settings(composed.values)
         return composed
 
@@ -190,7 +188,7 @@ class Composer:
         return Base.of(compose([*self._common, *overrides], "train", self._options))
 
 
-def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> Sweep:
+def read_sweep(overrides: Sequence[str], options: Namespace) -> Sweep:
     """Return the sweep that a line describes.
 
     Raises ``UserError`` for a line with a single job or with settings that a sweep cannot have, and for the
@@ -206,7 +204,7 @@ def read_sweep(command: str, overrides: Sequence[str], options: Namespace) -> Sw
         axes = {"prompt": prompt_axis(prompts.read())} | axes
     composer = Composer(options, search_path(overrides))
     jobs = expand(grid, axes, composer.has)
-    if command == "sweep" and node is None and prompts is None and len(jobs) == 1:
+    if node is None and prompts is None and len(jobs) == 1:
         raise UserError(NOTHING_TO_SWEEP)
     composed = compose_all(jobs, composer)
     keys = dict.fromkeys([*ALWAYS_SHOWN, *swept_keys(grid, axes)])
@@ -230,9 +228,7 @@ def compose_sweep(parts: Parts, options: Namespace) -> DictConfig:
 
     Raises ``UserError`` for wrong values, and Hydra's exceptions.
     """
-    # The flag --config-name is for the jobs and not for the sweep itself.
-    own = Namespace(**{**vars(options), "config_name": None})
-    cfg = compose(parts.own, "sweep", own)
+    cfg = compose(parts.own, "sweep", options)
     # A wrong setting of the launcher is found now, and not when the jobs are there.
     OmegaConf.to_container(cfg.hydra.launcher, resolve=True)
     is_answer = isinstance(cfg[DRY_RUN], bool)
@@ -270,8 +266,6 @@ def sort_overrides(overrides: Sequence[str]) -> Parts:
         key = key_of(override)
         if REFUSED_KEY.match(key):
             raise fail(key, expected=SWEEP_FOLDER, got=key, example=f"{SWEEP_FOLDER}=multirun/mine")
-        if key == "hydra.mode":
-            continue
         if key == KEY and "=" in override:
             parts.grid.append(f"{FILE}={override.partition('=')[2]}")
         elif GRID_KEY.match(key) or key == DRY_RUN:
@@ -310,8 +304,3 @@ def require_attempts(attempts: object) -> None:
 def search_path(overrides: Sequence[str]) -> list[str]:
     """Return the overrides that name more folders of YAML files."""
     return [line for line in overrides if key_of(line) == "hydra.searchpath"]
-
-
-@cache
-def _value(line: str) -> Any:
-    return OverridesParser.create().parse_override(line).value()

@@ -222,7 +222,6 @@ def test_a_prompt_is_needed():
         (("a cube", "prompt=a cone"), {}, "prompt: expected one value"),
         (("a cube", "hydra.run.dir=b"), {"folder": "a"}, "hydra.run.dir: expected one value"),
         (("a cube", "--cfg", "job"), {}, "in a shell"),
-        (("a cube", "-m"), {}, "in a shell"),
         (("a cube", "attempts=2"), {}, "in a shell"),
     ],
 )

@@ -255,7 +255,6 @@ def test_numbers_that_were_measured_in_different_ways_are_not_compared(train):
         (["attempts=0"], "attempts: expected a whole number >= 1 and <= 1000, got 0."),
         (["attempts=2", "select=psnrr"], "Try: select=psnr"),
         (["attempts=2", "metric=[]"], "Try: 'metric=[fidelity]'"),
-        (["attempts=2", "--multirun"], "attempts: expected 1 in a sweep"),
         (["attempts=1", "dry_run=true"], "dry_run: expected a sweep or several attempts"),
     ],
 )

@@ -186,7 +186,7 @@ def test_every_prompt_reaches_its_job_literally_with_its_settings(tmp_path):
     ]
     path.write_text(json.dumps(entries))
     line = [quoted(f"prompts={path}", is_sweep=True), "initializer=ball,shap_e"]
-    sweep = read_sweep("sweep", line, read_flags([])[0])
+    sweep = read_sweep(line, read_flags([])[0])
     composed = sweep.composed
     wanted = [(text.strip(), name) for text in [*HARSH, *LINES] for name in ("ball", "shap_e")]
     assert [(job.get("prompt"), job.get("initializer")) for job in composed] == wanted

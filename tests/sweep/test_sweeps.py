@@ -118,11 +118,6 @@ def only_sweep() -> Path:
 # --- one row per job --------------------------------------------------------------------------------------
 
 
-def test_train_with_a_flag_is_a_sweep(sweep):
-    assert sweep("-m", "prompt=a cube", "seed=0,1", command="train").code == 0
-    assert [row["seed"] for row in read_table(only_sweep())] == ["0", "1"]
-
-
 def test_the_table_has_one_row_per_job(hydra_sweep):
     result = hydra_sweep("prompt=a corgi, front view", "densifier=baseline,cadam", "seed=0,1")
     assert result.code == 0, result.err
@@ -612,7 +607,7 @@ def test_many_jobs_that_differ_in_values_are_composed_once(sweep, monkeypatch):
     original = plan.compose
     monkeypatch.setattr(plan, "compose", lambda *args: counted.append(args) or original(*args))
     line = ["prompt='a cube'", "seed=range(0,30)", "densifier.tau_Q=0.5,0.7"]
-    found = plan.read_sweep("sweep", line, read_flags([])[0]).composed
+    found = plan.read_sweep(line, read_flags([])[0]).composed
     assert [job.get("seed") for job in found] == [seed for seed in range(30) for _ in range(2)]
     assert len(counted) == 3  # the sweep, what its plain values are, and one job
 
@@ -630,15 +625,6 @@ def test_the_plan_records_folder_flags_and_line(sweep, tmp_path):
         *("--config-dir", "own", "prompt='a cube'", "densifier=mine,none", "hydra.sweep.dir='x'")
     ]
     assert [job.swept["densifier"] for job in remembered.jobs] == ["mine", "none"]
-
-
-def test_another_config_name_is_for_the_jobs_only(hydra_sweep, calls, small_configs):
-    """The sweep itself and its launcher keep their own YAML files."""
-    (small_configs / "mine.yaml").write_text(TRAIN.replace("steps: 5", "steps: 6"), encoding="utf-8")
-    flag = ["--config-name", "mine"]
-    result = hydra_sweep(*flag, "prompt=a cube", "seed=0,1", "hydra.sweep.dir=x")
-    assert result.code == 0, result.err
-    assert [call["words"][-3:-1] for call in calls(Path("x"))] == [flag] * 2
 
 
 def test_grids_and_components_are_found_on_a_search_path(sweep, tmp_path):
