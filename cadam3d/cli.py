@@ -5,9 +5,11 @@ Nothing heavy is imported before it is needed, so that help and the completion o
 
 import contextlib
 import gc
+import logging
 import os
 import shlex
 import sys
+import warnings
 from collections.abc import Sequence
 
 from cadam3d import __version__
@@ -37,12 +39,15 @@ Settings of an option:  cadam3d train --help densifier=cadam
 Tab completion (bash):  eval "$(cadam3d -sc install=bash)\""""
 HELP_FLAGS = ("--help", "-h", "help")
 COMPLETION_FLAGS = ("--shell-completion", "-sc")
+# Libraries that print their messages in their own way, and read their level from NAME_VERBOSITY.
+TALKATIVE = ("TRANSFORMERS", "DIFFUSERS", "HF_HUB")
 
 
 def main() -> None:
     """Run the command line of this process and exit: 0 for success, 1 for an error, 130 for an interrupt."""
     wants_traceback = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ.update(waiting(os.environ))
+    _hush_libraries()
     # Python processes that this one starts, such as the workers of a launcher, would import modules from the
     # current folder, where a file may be called yaml.py.
     os.environ["PYTHONSAFEPATH"] = "1"
@@ -65,6 +70,14 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
     sys.exit(code)
+
+
+def _hush_libraries() -> None:
+    """Hide the warnings of other libraries, which address programmers. PYTHONWARNINGS shows them."""
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)
+        os.environ.update({f"{name}_VERBOSITY": "error" for name in TALKATIVE} | os.environ)
 
 
 def dispatch(words: Sequence[str]) -> int:

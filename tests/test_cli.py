@@ -135,6 +135,33 @@ def test_help_is_instant_and_imports_nothing_heavy():
     subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY, timeout=60)
 
 
+WARN = """
+import logging, sys, warnings
+from cadam3d import cli
+def dispatch(words):
+    warnings.warn("of a library")
+    logging.getLogger("matplotlib").warning("of a library")
+    logging.getLogger("matplotlib").error("an error")
+    from transformers.utils import logging as of_transformers
+    of_transformers.get_logger("transformers.models").warning("of a library")
+    return 0
+cli.dispatch = dispatch
+cli.main()
+"""
+
+
+@pytest.mark.parametrize("chosen", ["", "default"])
+def test_warnings_of_other_libraries_are_shown_only_if_python_is_asked_to(chosen):
+    environment = {name: text for name, text in os.environ.items() if not name.endswith("_VERBOSITY")}
+    environment["PYTHONWARNINGS"] = chosen
+    command = [sys.executable, "-c", WARN]
+    ended = subprocess.run(
+        command, check=True, env=environment, cwd=REPOSITORY, capture_output=True, text=True
+    )
+    assert ended.stderr.count("of a library") == (3 if chosen else 0)
+    assert "an error" in ended.stderr
+
+
 @pytest.mark.parametrize("command", list(cli.COMMANDS))
 def test_every_command_has_a_module_and_a_file_of_settings(command):
     assert (REPOSITORY / f"cadam3d/commands/{command}.py").is_file()
