@@ -4,8 +4,10 @@ A model is a folder with a ``model_index.json``, which names a class for each of
 a text encoder, a tokenizer) is loaded separately and when it is needed. Unused parts are never downloaded.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,6 +18,7 @@ from torch import Tensor
 
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
+from cadam3d.core.memory import is_out_of_memory
 from cadam3d.io.jsonl import read_json
 
 INDEX = "model_index.json"
@@ -24,8 +27,25 @@ VOCABULARY = "vocabulary.json"  # in the folder of a model that knows only some 
 # the same on every machine, so the folder of a run can be moved.
 MODELS = Path(__file__).parent.parent / "models"
 PACKAGE = "package:"
-# Parts may only have classes of these libraries, so that no foreign code runs.
 LIBRARIES = ("diffusers", "transformers")
+# The module and the classes of each part. A model cannot choose any other class, because some read code that
+# the model brings.
+_CLIP_TOKENIZER = ("transformers", ("CLIPTokenizer", "CLIPTokenizerFast"))
+CLASSES = {
+    "unet": ("diffusers", ("UNet2DConditionModel",)),
+    "vae": ("diffusers", ("AutoencoderKL",)),
+    "transformer": ("diffusers", ("SD3Transformer2DModel",)),
+    "prior": ("diffusers", ("PriorTransformer",)),
+    "scheduler": ("diffusers", ("HeunDiscreteScheduler",)),
+    "shap_e_renderer": ("diffusers.pipelines.shap_e", ("ShapERenderer",)),
+    "text_encoder": ("transformers", ("CLIPTextModel", "CLIPTextModelWithProjection")),
+    "text_encoder_2": ("transformers", ("CLIPTextModelWithProjection",)),
+    **dict.fromkeys(("tokenizer", "tokenizer_2"), _CLIP_TOKENIZER),
+    "text_encoder_3": ("transformers", ("T5EncoderModel",)),
+    "tokenizer_3": ("transformers", ("T5Tokenizer", "T5TokenizerFast")),
+}
+# Keys of a part's configuration that would load further code or other weights.
+LOADING = ("attn_implementation", "quantization_config")
 EXTRA = ("diffusers", "transformers", "safetensors")
 DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
 
@@ -98,46 +118,48 @@ class Pretrained:
 
     def has(self, part: str) -> bool:
         """Return whether the model has ``part``, such as ``"text_encoder_3"``."""
-        return None not in (self.index.get(part) or [None])[:2]
+        return self.entry(part) is not None
+
+    def entry(self, part: str) -> tuple[str, str] | None:
+        """Return the library and the class that the index names for a part; None if it names none."""
+        found = self.index.get(part)
+        if not isinstance(found, list) or [type(each) for each in found] != [str, str]:
+            return None
+        return found[0], found[1]
 
     def part(self, name: str, dtype: torch.dtype | None = None) -> Any:
         """Load one part on the CPU; a network is frozen and in evaluation mode.
 
         Raises ``UserError`` if the part is missing or damaged, or the installed libraries lack its class.
         """
-        options: dict[str, Any] = {"subfolder": name, "revision": self.revision}
-        if dtype is not None:
-            options |= {"dtype": dtype, "variant": self.source.variant}
-        import diffusers
-        import transformers
-
-        transformers.utils.logging.disable_progress_bar()
-        diffusers.utils.logging.disable_progress_bar()
-        try:
-            loaded = self._kind(name).from_pretrained(self.where, **options)
-        except torch.OutOfMemoryError:
-            raise
-        except (OSError, ValueError, KeyError, RuntimeError, TypeError) as error:
-            raise self._unusable(f"{name} of {self.where} cannot be loaded ({short(error)})") from error
-        if isinstance(loaded, torch.nn.Module):
-            loaded.requires_grad_(False).eval()
-        elif name.startswith("tokenizer"):
-            self._check_vocabulary(name, len(loaded))
-        return loaded
+        kind, options = self._kind(name), {"subfolder": name, "revision": self.revision}
+        what = f"{name} of {self.where}"
+        if dtype is None:
+            loaded = read_model(kind, self.where, partial(self._unusable, what), **options)
+            if name.startswith("tokenizer"):
+                self._check_vocabulary(name, len(loaded))
+            return loaded
+        self.config(name)
+        options |= {"dtype": dtype, "variant": self.source.variant}
+        return read_network(kind, self.where, partial(self._unusable, what), **options)
 
     def config(self, name: str) -> dict[str, Any]:
         """Return the configuration of one part, without loading its weights."""
-        kind = self._kind(name)
         file = "scheduler_config.json" if name == "scheduler" else "config.json"
-        if Path(self.where).is_dir():
-            return _read_entries(self.source.key, Path(self.where) / name / file)
-        if hasattr(kind, "load_config"):
-            return dict(kind.load_config(self.where, subfolder=name, revision=self.revision))
-        return kind.config_class.from_pretrained(self.where, subfolder=name, revision=self.revision).to_dict()
+        place, reason = Path(self.where) / name / file, ""
+        if not Path(self.where).is_dir():
+            place, reason, _ = fetch_file(self.where, f"{name}/{file}", self.revision, True)
+        if place is None:
+            raise self._unusable(self.where, f"it has no {name}/{file} ({reason})")
+        entries = _read_entries(self.source.key, place)
+        if found := [key for key in LOADING if entries.get(key) is not None]:
+            raise self._unusable(f"{name} of {self.where}", f"expected no {found[0]} in its {file}")
+        return entries
 
     def skeleton(self, name: str, dtype: torch.dtype) -> Any:
         """Return a network on the meta device, built from its configuration without loading any weights."""
-        with torch.device("meta"):
+        refuse = partial(self._unusable, f"{name} of {self.where}")
+        with refused_by(refuse, "its configuration cannot be used"), torch.device("meta"):
             network = empty(self._kind(name), self.config(name))
         return network.to(dtype).requires_grad_(False).eval()
 
@@ -170,24 +192,66 @@ class Pretrained:
         If the files of a tokenizer are missing, transformers silently makes one that knows no word.
         """
         encoder = name.replace("tokenizer", "text_encoder")
-        wanted = self._kind(encoder).config_class.from_dict(self.config(encoder)).vocab_size
+        refuse = partial(self._unusable, f"{name} of {self.where}")
+        with refused_by(refuse, f"the configuration of its {encoder} cannot be used"):
+            wanted = self._kind(encoder).config_class.from_dict(self.config(encoder)).vocab_size
         # The encoder of T5 has room for a few more pieces than its tokenizer has.
         if size < wanted / 2:
-            raise self._unusable(f"{name} of {self.where} knows {size} of the {wanted} pieces of text")
+            raise refuse(f"it knows {size} of the {wanted} pieces of text")
 
     def _kind(self, name: str) -> Any:
-        library, kind = (str(entry) for entry in (self.index.get(name) or (None, None))[:2])
-        # Some parts belong to a single pipeline, such as the renderer of Shap-E.
-        place = library if library in LIBRARIES else f"diffusers.pipelines.{library}"
-        has_place = library.isidentifier() and find_spec(place) is not None
-        found = getattr(import_module(place), kind, None) if has_place else None
-        if found is None:
-            raise self._unusable(f"the installed libraries have no {library}.{kind}, its {name}")
-        return found
+        """Return the class of a part. Raises ``UserError`` unless the part may have it."""
+        place, kinds = CLASSES[name]
+        library, kind = self.entry(name) or ("", "")
+        if kind not in kinds:
+            expected = f"expected a {' or '.join(kinds)}, got {f'{library}.{kind}' if kind else 'nothing'}"
+            raise self._unusable(f"{name} of {self.where}", expected)
+        return getattr(import_module(place), kind)
 
-    def _unusable(self, problem: str) -> UserError:
-        """Return the error about a part that cannot be used."""
-        return UserError(f"{self.source.key}: {problem}. Try: {self.source.key}.path=DIR")
+    def _unusable(self, what: str, problem: str) -> UserError:
+        """Return the error about something that cannot be used."""
+        return UserError(f"{self.source.key}: {what}: {problem}. Try: {self.source.key}.path=DIR")
+
+
+def read_model(kind: Any, where: str | Path, refuse: Callable[[str], UserError], **options: Any) -> Any:
+    """Return what a class of diffusers or transformers reads from a folder, or from a model on the hub.
+
+    No code of the model runs, and nothing is asked. ``refuse`` makes the error about whatever goes wrong.
+    """
+    import diffusers
+    import transformers
+
+    diffusers.utils.logging.disable_progress_bar()
+    transformers.utils.logging.disable_progress_bar()
+    if kind.__module__.startswith("transformers."):
+        options["trust_remote_code"] = False
+    with refused_by(refuse, f"its {kind.__name__} cannot be loaded"):
+        return kind.from_pretrained(where, local_files_only=Path(where).is_dir(), **options)
+
+
+@contextmanager
+def refused_by(refuse: Callable[[str], UserError], problem: str) -> Iterator[None]:
+    """Turn the errors of a reader into those of ``refuse``: a damaged file makes it raise almost anything.
+
+    Lack of memory stays what it is.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        if is_out_of_memory(error):
+            raise
+        raise refuse(f"{problem} ({short(error) or type(error).__name__})") from error
+
+
+def read_network(kind: Any, where: str | Path, refuse: Callable[[str], UserError], **options: Any) -> Any:
+    """Return a network, frozen and on the CPU; see :func:`read_model`."""
+    network, report = read_model(kind, where, refuse, output_loading_info=True, **options)
+    # With weights of another model, transformers draws the missing ones at random and goes on.
+    if missing := sorted(report["missing_keys"]):
+        raise refuse(f"it is not a {kind.__name__}: {missing[0]} is missing")
+    return network.requires_grad_(False).eval()
 
 
 def empty(kind: Any, config: Mapping[str, Any]) -> Any:

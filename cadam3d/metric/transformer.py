@@ -5,7 +5,6 @@ weights in the format of safetensors are read. Other formats can run code when t
 """
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
@@ -16,8 +15,8 @@ import torch
 
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
-from cadam3d.core.memory import is_out_of_memory
-from cadam3d.io.pretrained import require_extra, short
+from cadam3d.io.jsonl import read_json
+from cadam3d.io.pretrained import read_model, read_network, require_extra, short
 
 CONFIG = "config.json"
 WEIGHTS = "model.safetensors"
@@ -92,9 +91,12 @@ class TransformerFolder:
     def entries(self, name: str = CONFIG) -> dict[str, Any]:
         """Return the content of a JSON file of the model. Raises ``UserError`` if it cannot be read."""
         try:
-            return json.loads((self.folder / name).read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+            entries = read_json(self.folder / name)
+        except UserError as error:
             raise self.damaged(f"{name}: {short(error)}") from error
+        if not isinstance(entries, dict):
+            raise self.damaged(f"{name}: expected names with values, got other data")
+        return entries
 
     def weights(self) -> list[Path]:
         """Return the files of the weights, in the order of their names.
@@ -106,7 +108,8 @@ class TransformerFolder:
 
         names = [WEIGHTS]
         if not (self.folder / WEIGHTS).is_file() and (self.folder / SHARDS).is_file():
-            names = sorted(set(self.entries(SHARDS)["weight_map"].values()))
+            shards = self.entries(SHARDS).get("weight_map")
+            names = sorted(set(map(str, shards.values()))) if isinstance(shards, dict) else [WEIGHTS]
         for name in names:
             if not (self.folder / name).is_file():
                 raise self.damaged(f"it has no {name}, and no other format is read, since it could run code")
@@ -122,25 +125,12 @@ class TransformerFolder:
 
         Raises ``UserError`` if a file is missing or damaged, or if it lacks weights that ``kind`` has.
         """
-        import transformers
-
         self.weights()
-        transformers.utils.logging.disable_progress_bar()
-        model, report = self.read(kind, use_safetensors=True, dtype=dtype, output_loading_info=True)
-        # With weights of another model, transformers draws the missing ones at random and goes on.
-        if missing := sorted(report["missing_keys"]):
-            raise self.damaged(f"it is not a {kind.__name__}: {missing[0]} is missing")
-        return model.requires_grad_(False).eval()
+        return read_network(kind, self.folder, self.damaged, use_safetensors=True, dtype=dtype)
 
     def read(self, kind: Any, **options: Any) -> Any:
         """Return what a class of transformers reads from the folder, such as a tokenizer."""
-        try:
-            return kind.from_pretrained(self.folder, trust_remote_code=False, **options)
-        # A damaged file makes its reader raise almost anything.
-        except Exception as error:
-            if is_out_of_memory(error):
-                raise
-            raise self.damaged(f"its {kind.__name__} cannot be loaded ({short(error)})") from error
+        return read_model(kind, self.folder, self.damaged, **options)
 
     def facts(self) -> dict[str, Any]:
         """Return what the record of a number says about the model."""

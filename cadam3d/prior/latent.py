@@ -38,6 +38,7 @@ PRIORS = {
 }
 # Every model of this family has this factor between an image and its latents.
 FACTOR = 8  # pixels per side
+MOST_STEPS = 100_000  # in the table of noise levels of a model
 # The levels at which a network is used: only the ones in the table that it was trained on, or any.
 LEVELS = ("table", "any")
 # A network recognises nothing in images of more than this many times the size of those in its training.
@@ -289,12 +290,16 @@ class LatentPrior(DiffusionPrior):
         """Return ``path`` at the rows of the model's table only, or unchanged if any level is used."""
         if self.noise_levels == "any":
             return path
-        return Rows(path=path, rows=self.scheduler["num_train_timesteps"])
+        return Rows(path=path, rows=int(number_in(self.scheduler, "num_train_timesteps", 1, MOST_STEPS)))
 
     @cached_property
     def vae(self) -> Any:
         """Return the autoencoder, frozen and on the device."""
-        return self.found.part("vae", self._vae_dtype).to(self.device)
+        vae = self.found.part("vae", self._vae_dtype).to(self.device)
+        number_in(vae.config, "scaling_factor", 1e-3, 1e3)
+        if vae.config.shift_factor is not None:
+            number_in(vae.config, "shift_factor", -1e3, 1e3)
+        return vae
 
     @cached_property
     def network(self) -> Any:
@@ -391,6 +396,19 @@ class LatentPrior(DiffusionPrior):
         return (type(self).__name__, self.found.identity, str(self.torch_dtype), *self.encoders)
 
 
+def number_in(entries: Mapping[str, Any], name: str, low: float, high: float) -> float:
+    """Return a number in the configuration of a model. Raises ``UserError`` unless it is in the range."""
+    value: Any = entries.get(name)
+    require(
+        type(value) in (int, float) and low <= value <= high,
+        "prior.path",
+        expected=f"a model with a {name} from {low} to {high}",
+        got=value,
+        example="prior.path=DIR",
+    )
+    return value
+
+
 def ddpm_path(scheduler: Mapping[str, Any]) -> NoisePath:
     """Return the noise path of a scheduler's configuration. Raises ``UserError`` for unknown kinds."""
     kind = scheduler.get("beta_schedule")
@@ -403,9 +421,9 @@ def ddpm_path(scheduler: Mapping[str, Any]) -> NoisePath:
         example="prior.path=DIR",
     )
     return DDPM(
-        train_steps=scheduler["num_train_timesteps"],
-        beta_start=scheduler["beta_start"],
-        beta_end=scheduler["beta_end"],
+        train_steps=int(number_in(scheduler, "num_train_timesteps", 1, MOST_STEPS)),
+        beta_start=number_in(scheduler, "beta_start", 0, 1),
+        beta_end=number_in(scheduler, "beta_end", 0, 1),
     )
 
 
@@ -414,7 +432,7 @@ Complete = Callable[[Tensor, Tensor, Tensor], Prediction]
 
 def completion(path: NoisePath, scheduler: Mapping[str, Any]) -> Complete:
     """Return the function that converts outputs to predictions. Raises ``UserError`` for unknown kinds."""
-    kind = scheduler.get("prediction_type", "epsilon")
+    kind = str(scheduler.get("prediction_type", "epsilon"))
     ways: dict[str, Complete] = {
         "epsilon": path.from_noise,
         "v_prediction": path.from_velocity,

@@ -22,6 +22,7 @@ from cadam3d.io.pretrained import (
     Pretrained,
     empty,
     fetch_file,
+    read_model,
     read_tensors,
     require_extra,
     short,
@@ -142,8 +143,8 @@ class SingleFile(LatentDiffusion):
 
         config, key = self.config("text_encoder"), f"{self.source.key}.tokenizer"
         length, pieces = config["max_position_embeddings"], config["vocab_size"]
-        with suppress(OSError, ValueError):
-            loaded = CLIPTokenizer.from_pretrained(self.tokenizer, model_max_length=length)
+        with suppress(UserError):
+            loaded = read_model(CLIPTokenizer, self.tokenizer, UserError, model_max_length=length)
             # If the files are missing, transformers may silently make a tokenizer that knows no word.
             if len(loaded) == pieces:
                 loaded.pad_token_id = 0
@@ -154,8 +155,8 @@ class SingleFile(LatentDiffusion):
 
 def with_ldm_unet(found: Pretrained) -> Pretrained:
     """Return ``found``, or a model that reads its UNet by these names if the UNet has a foreign class."""
-    library = str((found.index.get("unet") or [None])[0])
-    if library in LIBRARIES:
+    entry = found.entry("unet")
+    if entry is None or entry[0] in LIBRARIES:
         return found
     index = found.index | {"unet": list(PARTS["unet"])}
     files = {"unet": (_unet_file(found), UNET)}

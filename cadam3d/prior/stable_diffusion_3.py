@@ -14,11 +14,12 @@ from torch.nn import functional as F  # noqa: N812  (the usual name)
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.checks import require, require_choice
 from cadam3d.io.pretrained import Pretrained
-from cadam3d.prior.latent import LatentPrior
+from cadam3d.prior.latent import LatentPrior, number_in
 from cadam3d.prior.path import Latents, NoisePath, PerView, Prediction, RectifiedFlow
 from cadam3d.prior.texts import T5_TOKENS, Texts, penultimate, tokenize
 
 T5 = "text_encoder_3"
+MOST_WIDTH = 100_000  # of a token
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +64,9 @@ class StableDiffusion3(LatentPrior):
             got="dynamic shifting",
             example="prior.path=DIR",
         )
-        return self.at_levels(RectifiedFlow(shift=float(self.scheduler.get("shift", 1.0))))
+        return self.at_levels(
+            RectifiedFlow(shift=number_in({"shift": 1.0, **self.scheduler}, "shift", 0.01, 100))
+        )
 
     def complete(self, noisy: Latents, output: Latents, t: PerView) -> Prediction:
         """Complete the network's output, which is the velocity."""
@@ -75,7 +78,9 @@ class StableDiffusion3(LatentPrior):
         dtype = self.torch_dtype
         clip = [penultimate(found, part, texts, dtype, device) for part in ("text_encoder", "text_encoder_2")]
         both = torch.cat([each.tokens for each in clip], dim=-1)
-        width = found.config(self.network_part)["joint_attention_dim"]
+        width = int(
+            number_in(found.config(self.network_part), "joint_attention_dim", both.shape[-1], MOST_WIDTH)
+        )
         long = both.new_zeros(len(texts), 1, width)
         if T5 in self.encoders:
             numbers = tokenize(found.part("tokenizer_3"), texts, T5_TOKENS).to(device)

@@ -11,12 +11,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
 from cadam3d.io.pretrained import Pretrained
 
 # Tokens per text, of CLIP and of T5.
 TOKENS, T5_TOKENS = 77, 256
+MOST_TOKENS = 10_000  # per text, of any tokenizer
 
 
 @dataclass(frozen=True)
@@ -92,10 +94,18 @@ class TextCache:
 
 def tokenize(tokenizer: Any, texts: Sequence[str], length: int | None = None) -> Tensor:
     """Return token numbers, cut or padded to ``length`` (None = the length that the tokenizer defines)."""
+    longest = length or tokenizer.model_max_length
+    require(
+        type(longest) is int and 0 < longest <= MOST_TOKENS,
+        "prior.path",
+        expected=f"a tokenizer with a model_max_length of at most {MOST_TOKENS}",
+        got=longest,
+        example="prior.path=DIR",
+    )
     return tokenizer(
         list(texts),
         padding="max_length",
-        max_length=length or tokenizer.model_max_length,
+        max_length=longest,
         truncation=True,
         return_tensors="pt",
     ).input_ids
