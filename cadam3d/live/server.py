@@ -9,7 +9,7 @@ import os
 import secrets
 import socketserver
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -17,13 +17,14 @@ from typing import Any, BinaryIO
 
 from cadam3d.io.jsonl import to_json
 from cadam3d.io.reading import signature
-from cadam3d.live.subject import ShownFile
+from cadam3d.live.subject import OFFERED, ShownFile
 from cadam3d.viewer import page as viewer
 
 HOST = "127.0.0.1"
 # The names by which a browser on this machine calls it. Any other name may belong to a foreign page that was
 # made to lead here (DNS rebinding).
 OWN_NAMES = ("127.0.0.1", "localhost")
+REPORT = "report"  # the name of the report in an address
 REQUESTS = ("pause", "resume", "save", "stop")
 LONGEST_BODY = 1000  # bytes of a request
 PIECE = 1 << 20  # bytes of a file that are sent at once
@@ -44,7 +45,8 @@ POLICY = (
     "img-src 'self' data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 # The report is a page by the author of the run. In a sandbox it belongs to no origin, so it can neither read
-# what this server answers nor press a button.
+# what this server answers nor press a button. It can lead the browser to another page and tell that page its
+# own address, so it has an address with a token of its own, which admits to nothing else of the page.
 REPORT_POLICY = (
     "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline'; "
     "style-src 'unsafe-inline'; worker-src blob:; img-src data: blob:; media-src data:; font-src data:; "
@@ -86,7 +88,7 @@ class Server(ThreadingHTTPServer):
 
     def __init__(self, subject: ShownFile, port: int) -> None:
         """Listen on ``port``, or on any free one if it is 0. Raises ``OSError`` if that is impossible."""
-        self.subject, self.token = subject, secrets.token_urlsafe(18)
+        self.subject, self.token, self.report_token = subject, *(secrets.token_urlsafe(18) for _ in range(2))
         super().__init__((HOST, port), Handler)
 
     def server_bind(self) -> None:
@@ -108,7 +110,8 @@ class Server(ThreadingHTTPServer):
 class Handler(BaseHTTPRequestHandler):
     """Answers the requests of one connection."""
 
-    protocol_version = "HTTP/1.1"
+    # A connection ends with its answer, so what is left of a request is never read as the next one.
+    protocol_version = "HTTP/1.0"
     server_version, sys_version = "cadam3d", ""
     timeout = IDLE_SECONDS
     server: Server
@@ -118,7 +121,9 @@ class Handler(BaseHTTPRequestHandler):
         if (name := self._admitted()) is None:
             return
         subject = self.server.subject
-        if name in FIXED:
+        if name == REPORT and self.token == self.server.token:
+            self._redirect(f"/{self.server.report_token}/{REPORT}")
+        elif name in FIXED:
             kind, content = FIXED[name]
             self._send(content(), kind)
         elif name in CURRENT:
@@ -162,23 +167,34 @@ class Handler(BaseHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:
         """Print nothing, because the address of a request has the token."""
 
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Answer a request that the library refuses, such as one with an unknown method."""
+        self._refuse(HTTPStatus(code), message or explain or "This request cannot be answered.")
+
     def _admitted(self) -> str | None:
-        """Return the part of the path after the token; None if the request was refused."""
+        """Return the part of the path after the token; None if the request was refused.
+
+        With the token of the report, only the report and the files to which it links are left.
+        """
         host, _, port = self.headers.get("Host", "").partition(":")
         parts = self.path.partition("?")[0].split("/", 2)
-        token = parts[1] if parts[0] == "" and len(parts) > 1 else ""
+        self.token = parts[1] if parts[0] == "" and len(parts) > 1 else ""
+        tokens = (self.server.token, self.server.report_token)
+        known = [hmac.compare_digest(self.token.encode(), token.encode()) for token in tokens]
         if host not in OWN_NAMES or not (port.isdecimal() or not port):
             self._refuse(HTTPStatus.FORBIDDEN, "This name does not belong to this server.")
-        elif not hmac.compare_digest(token.encode(), self.server.token.encode()):
+        elif not any(known):
             self._refuse(HTTPStatus.FORBIDDEN, "Open the whole address that cadam3d view has printed.")
         elif len(parts) == 2:
-            self.send_response(HTTPStatus.MOVED_PERMANENTLY)
-            self.send_header("Location", f"/{token}/")
-            self.send_header("Content-Length", "0")
-            self.end_headers()
+            self._redirect(f"/{self.token}/")
+        elif known[1] and (self.command == "POST" or parts[2] not in (REPORT, *OFFERED)):
+            self._refuse(HTTPStatus.FORBIDDEN, "The report has no access to this.")
         else:
             return parts[2]
         return None
+
+    def _redirect(self, address: str) -> None:
+        self._begin(HTTPStatus.FOUND, TEXT, 0, POLICY, {"Location": address})
 
     def _send(self, content: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
         self._begin(status, kind, len(content), POLICY)
@@ -186,7 +202,7 @@ class Handler(BaseHTTPRequestHandler):
             self.wfile.write(content)
 
     def _send_file(self, file: BinaryIO, name: str) -> None:
-        is_report = name == "report"
+        is_report = name == REPORT
         size = signature(file)[2]
         policy = REPORT_POLICY if is_report else POLICY
         self._begin(HTTPStatus.OK, HTML if is_report else BYTES, size, policy)
@@ -194,18 +210,16 @@ class Handler(BaseHTTPRequestHandler):
             self.wfile.write(piece)
             size -= len(piece)
 
-    def _begin(self, status: HTTPStatus, kind: str, length: int, policy: str) -> None:
+    def _begin(
+        self, status: HTTPStatus, kind: str, length: int, policy: str, more: Mapping[str, str] | None = None
+    ) -> None:
         self.send_response(status)
-        for header, value in HEADERS.items():
+        for header, value in (HEADERS | dict(more or {})).items():
             self.send_header(header, value)
         self.send_header("Content-Security-Policy", policy)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(length))
-        if self.close_connection:
-            self.send_header("Connection", "close")
         self.end_headers()
 
     def _refuse(self, status: HTTPStatus, text: str) -> None:
-        # The body of the request may be unread, so the next request would begin in the middle of it.
-        self.close_connection = True
         self._send(f"{text}\n".encode(), TEXT, status)

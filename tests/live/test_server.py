@@ -3,9 +3,10 @@
 import http.client
 import json
 import shutil
+import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -94,7 +95,23 @@ class Browser:
         return answer.status, answer.headers, content
 
     def get(self, path, **options):
-        return self.ask("GET", path, **options)
+        """Ask, and follow a redirection as a browser does."""
+        answer = self.ask("GET", path, **options)
+        if answer[0] != 302:
+            return answer
+        _, token, path = answer[1]["Location"].split("/", 2)
+        return self.ask("GET", path, **options | {"token": token})
+
+    def send(self, text: str) -> bytes:
+        """Send the bytes of a request, and return everything that the server answers until it hangs up."""
+        with socket.create_connection(("127.0.0.1", self.server.server_port), timeout=20) as connection:
+            connection.sendall(text.encode())
+            connection.shutdown(socket.SHUT_WR)
+            pieces = []
+            # A server that hangs up before it has read everything may reset the connection.
+            with suppress(ConnectionError):
+                pieces.extend(iter(lambda: connection.recv(1 << 16), b""))
+            return b"".join(pieces)
 
     def json(self, path):
         status, _, content = self.get(path)
@@ -124,8 +141,9 @@ def test_the_page_and_its_parts_are_served(browser):
 
 
 def test_every_answer_has_the_headers_that_keep_others_out(browser):
-    for path in ("", "state", "picture", "asset.ply", "report", "nothing"):
-        _, headers, _ = browser.get(path)
+    answers = [(path, browser.get(path)) for path in ("", "state", "picture", "asset.ply", "report", "x")]
+    answers += [("", browser.ask(*request)) for request in (("GET", "report"), ("DELETE", ""), ("HEAD", ""))]
+    for path, (_, headers, _) in answers:
         assert headers["Cache-Control"] == "no-store"
         assert headers["X-Content-Type-Options"] == "nosniff"
         assert "default-src 'none'" in headers["Content-Security-Policy"]
@@ -182,6 +200,40 @@ def test_a_report_is_in_a_sandbox(browser):
     assert content == b"<script>alert(1)</script>"
     assert headers["Content-Security-Policy"].startswith("sandbox allow-scripts allow-downloads;")
     assert "allow-same-origin" not in headers["Content-Security-Policy"]
+
+
+def test_the_report_has_an_address_that_opens_nothing_else(browser, run):
+    """Its scripts may lead the browser to another page, which then knows the address of the report."""
+    status, headers, _ = browser.ask("GET", "report")
+    _, token, name = headers["Location"].split("/")
+    assert (status, name, token != browser.server.token) == (302, "report", True)
+    assert browser.get("asset.ply", token=token)[0] == 200
+    for path in ("", "state", "picture", "charts", "page.js", "saved/4"):
+        assert browser.get(path, token=token)[0] == 403
+    with training(run):
+        process = browser.json("state")["process"].encode()
+        assert browser.post("stop", process, token=token) == 403
+
+
+@pytest.mark.parametrize("first", ["GET", "POST", "DELETE"])
+@pytest.mark.parametrize("length", ["Content-Length: {}", "Transfer-Encoding: chunked\r\nContent-Length: {}"])
+def test_the_body_of_a_request_is_not_read_as_the_next_one(browser, run, first, length):
+    """A foreign page can send a body to an address, and a browser uses one connection for many requests."""
+    with training(run):
+        host = browser.origin.removeprefix("http://")
+        process = browser.json("state")["process"]
+        hidden = f"POST /{browser.server.token}/stop HTTP/1.1\r\nHost: {host}\r\nOrigin: {browser.origin}"
+        hidden += f"\r\nContent-Length: {len(process)}\r\n\r\n{process}"
+        head = f"{first} /{browser.server.token}/state HTTP/1.1\r\nHost: {host}\r\n"
+        answer = browser.send(f"{head}{length.format(len(hidden))}\r\n\r\n{hidden}")
+        assert answer.count(b"HTTP/1.") <= 1
+        assert not live.is_asked(run, "stop")
+
+
+def test_a_request_that_is_no_http_gets_the_headers_too(browser):
+    answer = browser.send("GET / HTTP/9.9\r\n\r\n") + browser.send("BREW / HTTP/1.1\r\n\r\n")
+    assert b"501" in answer
+    assert b"Content-Security-Policy" in answer.partition(b"501")[2]
 
 
 def test_a_single_file_is_shown_without_anything_of_a_run(run):
