@@ -30,8 +30,7 @@ from cadam3d.settings.options import (
 )
 
 NARROWEST, WIDEST = 60, 120  # characters per line
-# Characters. The description of a longer key begins on the next line.
-FIRST_COLUMN = 32
+FIRST_COLUMN = 32  # characters; the description of a longer key begins on the next line
 SCHEDULES = "cadam3d.core.schedule."
 SENTENCE_END = re.compile(r"(?<=[.!?])(?<!al\.)(?<!sec\.)(?<!fig\.)(?<!eq\.)\s+")
 KEY = re.compile(r"(\s*)(\w+):(?=\s|$)(.*)")
@@ -119,14 +118,10 @@ class Library:
         bases, choices = _defaults(read_yaml(path))
         groups = choices.keys() & self.options.keys()
         chosen = [Setting(key=key, value=spelled(value)) for key, value in choices.items() if key in groups]
-        words = {
-            ".".join([*package_of(group, path), key]): note for key, note in self._words(group, name).items()
-        }
-        return Option(
-            about=about_of(path),
-            base=next((base for base, _ in bases if "/" not in base), ""),
-            settings=(*chosen, *_settings(values, words)),
-        )
+        place, notes = package_of(group, path), self._words(group, name)
+        words = {".".join([*place, key]): note for key, note in notes.items()}
+        base = next((base for base, _ in bases if "/" not in base), "")
+        return Option(about=about_of(path), base=base, settings=(*chosen, *_settings(values, words)))
 
     def _words(self, group: str, name: str) -> dict[str, str]:
         """Return the words in the file of an option and in those that it builds on, by key in the file."""
@@ -153,8 +148,7 @@ def help_text(command: str, overrides: Sequence[str], folders: Sequence[Path]) -
     for word in overrides:
         name, equals, value = word.lstrip("+").partition("=")
         if name in groups and equals:
-            chosen = [option for option in NAME.findall(value) if option != "null"]
-            parts += [_option(library, name, option) for option in chosen]
+            parts += [_option(library, name, each) for each in NAME.findall(value) if each != "null"]
         elif name in groups:
             parts.append(_group(library, groups[name]))
         elif name in library.options or not equals:
@@ -248,10 +242,9 @@ def _overview(library: Library, command: str, groups: dict[str, Choices]) -> lis
 
 def _group(library: Library, group: Choices) -> str:
     """Return the text for a group, with one line for each option."""
-    rows = [
-        (("* " if name in group.chosen else "  ") + name, library.summary(group.name, name))
-        for name in library.options[group.name]
-    ]
+    names = library.options[group.name]
+    marked = [f"* {name}" if name in group.chosen else f"  {name}" for name in names]
+    rows = zip(marked, (library.summary(group.name, name) for name in names), strict=True)
     return f"{_wrapped(f'{group.name}: {group.words}')}\n{_table(rows)}"
 
 
