@@ -43,6 +43,9 @@ MOST_STEPS = 100_000  # in the table of noise levels of a model
 LEVELS = ("table", "any")
 # A network recognises nothing in images of more than this many times the size of those in its training.
 LARGEST = 2
+# In float16, the largest element of a view's gradient on its latents is brought between 2 ** (LIFT - 1) and
+# 2 ** LIFT. That is in the middle between the numbers that are rounded to zero and those that overflow.
+LIFT = 3
 # Numbers that the autoencoder keeps for a backward pass, per pixel and per channel of its first layer. All
 # models of this family have the same layers.
 KEPT = 24
@@ -354,8 +357,11 @@ class LatentPrior(DiffusionPrior):
         return F.interpolate(images, size, mode="bilinear")
 
     def _to_latents(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c lh lw"]:
-        config = self.vae.config
-        mean = self.vae.encode((2 * images - 1).to(self.vae.dtype)).latent_dist.mode().float()
+        config, dtype = self.vae.config, self.vae.dtype
+        images = 2 * images - 1
+        mean = self.vae.encode(images.to(dtype)).latent_dist.mode().float()
+        if dtype == torch.float16 and mean.requires_grad:
+            lift_gradient(images, mean)
         return (mean - (config.shift_factor or 0)) * config.scaling_factor
 
     def _outputs(self, noisy: Latents, t: PerView, condition: TextCondition, weights: Tensor) -> Tensor:
@@ -407,6 +413,26 @@ def number_in(entries: Mapping[str, Any], name: str, low: float, high: float) ->
         example="prior.path=DIR",
     )
     return value
+
+
+def lift_gradient(inputs: Float[Tensor, "b ..."], outputs: Float[Tensor, "b ..."]) -> None:
+    """Let a float32 gradient pass float16 between ``outputs`` and ``inputs`` without being rounded away.
+
+    Many objectives divide by the number of elements, and float16 has no number between 0 and 6e-8. So the
+    gradient of each view is multiplied by a power of two at the outputs, and divided by it at the inputs.
+    Neither tensor may be a leaf or be used elsewhere.
+    """
+    scales: list[Tensor] = []
+
+    def lift(grad: Tensor) -> Tensor:
+        largest = grad.abs().amax(dim=tuple(range(1, grad.ndim)), keepdim=True)
+        # The limits concern numbers that not even float32 has, and gradients without a single finite element.
+        exponents = (LIFT - torch.frexp(largest).exponent).clamp(-100, 100)
+        scales[:] = [torch.ldexp(torch.ones_like(largest), exponents)]
+        return grad * scales[0]
+
+    outputs.register_hook(lift)
+    inputs.register_hook(lambda grad: grad / scales[0])
 
 
 def ddpm_path(scheduler: Mapping[str, Any]) -> NoisePath:
