@@ -177,6 +177,12 @@ def test_objectives_and_densifiers_train(tmp_path, guidance, densifier, type_in)
     assert "PSNR" in out
 
 
+def test_a_mesh_is_listed_among_the_files_of_a_run(tmp_path, type_in):
+    mesh = ["exporter=mesh", "exporter.mesh.level=0.05", "exporter.mesh.resolution=16"]
+    out, _ = type_in(tmp_path, "train", *SMALL, "prompt=a red torus", "steps=1", *mesh)
+    assert "asset_mesh.glb" in out
+
+
 def test_a_dry_run_on_the_tiny_prior_prints_that_its_result_is_meaningless(tmp_path, type_in):
     words = [*BARE, "prior=tiny", "prompt=anything at all", "steps=2"]
     out, err = type_in(tmp_path, "train", *words)

@@ -71,6 +71,9 @@ class Results:
             gaussians=gaussians, render=context.render, prompt=context.prompt, truth=self.truth, asset=asset
         )
         summary |= measure(self.metrics, measurand, start, warnings)
+        summary["files"] = [
+            output.path.name for output in outputs if output.exporter and output.exporter.files
+        ]
         if asset is not None:
             summary["asset_bytes"] = asset.stat().st_size
         # This is the last entry of a complete summary.
@@ -126,5 +129,8 @@ def print_result(folder: Path, summary: Mapping[str, Any]) -> None:
     for label, name in (("asset", ASSET), ("video", TURNTABLE), ("pictures", PREVIEW), ("report", REPORT)):
         if (folder / name).exists():
             show(f"  {label:<9}{shown(folder / name)}")
+    for name in summary.get("files", []):
+        if name not in (ASSET, TURNTABLE, PREVIEW):
+            show(f"  {'file':<9}{shown(folder / name)}")
     if summary["outcome"] == Outcome.INTERRUPTED:
         show(f"  continue with: cadam3d train resume={shown(folder)}")

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from cadam3d.core.checks import require_choice, require_whole
+from cadam3d.core.checks import require_choice, require_whole, unless_none
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.mesh.surface import SurfaceSettings
@@ -12,12 +12,15 @@ from cadam3d.core.rendering import RenderFn
 from cadam3d.exporter.base import Contents, Exporter
 from cadam3d.io.atlas import paint, require_xatlas
 from cadam3d.io.frames import UPS
-from cadam3d.io.mesh import FORMATS, read_mesh, write_glb, write_mesh_ply, write_obj
+from cadam3d.io.mesh import FORMATS, read_mesh, write_glb, write_mesh_ply, write_obj, write_stl
+
+# Slicers and printers have +z up, glTF and most editors +y.
+USUAL_UP = {"glb": "+y", "obj": "+y", "ply": "+y", "stl": "+z"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeshExporter(SurfaceSettings, Exporter):
-    """Write ``asset_mesh.glb``, ``.obj`` or ``.ply``: the outer surface with its colours."""
+    """Write ``asset_mesh.glb``, ``.obj``, ``.ply`` or ``.stl``: the outer surface, in stl without colours."""
 
     node: ClassVar[str] = "exporter.mesh"
     files: ClassVar = tuple(f"asset_mesh.{each}" for each in FORMATS)
@@ -27,24 +30,33 @@ class MeshExporter(SurfaceSettings, Exporter):
     sh_loss: ClassVar = "without view-dependent colours"
 
     format: str  # one of FORMATS
-    up: str  # up axis of the file, one of UPS
+    up: str | None  # up axis of the file, one of UPS; None = USUAL_UP
     texture: int | None  # pixels per side; None = vertex colours
     textured_triangles: int  # at most, with a texture
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_choice("exporter.mesh.format", self.format, FORMATS)
-        require_choice("exporter.mesh.up", self.up, UPS)
+        unless_none(require_choice, "exporter.mesh.up", self.up, choices=UPS)
         require_whole("exporter.mesh.textured_triangles", self.textured_triangles, low=100, high=2**31)
         if self.texture is None:
             return
         require_whole("exporter.mesh.texture", self.texture, low=64, high=8192)
-        if self.format == "ply":
+        if self.format in ("ply", "stl"):
             raise UserError(
-                "exporter.mesh.texture: expected null with format=ply, which has no textures, "
+                f"exporter.mesh.texture: expected null with format={self.format}, which has no textures, "
                 f"got {self.texture}. Try: exporter.mesh.format=glb"
             )
         require_xatlas()
+
+    @property
+    def up_axis(self) -> str:
+        """Return the up axis of the file."""
+        return self.up or USUAL_UP[self.format]
+
+    def losses(self, sh_degree: int) -> str:
+        """Return what a mesh loses of Gaussians."""
+        return f"{self.loss}, without colours" if self.format == "stl" else super().losses(sh_degree)
 
     def most_triangles(self) -> int | None:
         """Return the most triangles that the surface may have.
@@ -65,11 +77,13 @@ class MeshExporter(SurfaceSettings, Exporter):
         texture = None if self.texture is None else paint(surface, painter.colors, self.texture)
         path = folder / self.file_name
         if self.format == "obj":
-            return write_obj(path, surface, up=self.up, texture=texture)
+            return write_obj(path, surface, up=self.up_axis, texture=texture)
         if self.format == "ply":
-            write_mesh_ply(path, surface, up=self.up)
+            write_mesh_ply(path, surface, up=self.up_axis)
+        elif self.format == "stl":
+            write_stl(path, surface, up=self.up_axis)
         else:
-            write_glb(path, surface, up=self.up, texture=texture)
+            write_glb(path, surface, up=self.up_axis, texture=texture)
         return [path]
 
     def contents(self, path: Path, gaussians: Gaussians) -> Contents:
@@ -82,4 +96,4 @@ class MeshExporter(SurfaceSettings, Exporter):
         mesh = read_mesh(path)
         closed = "watertight" if mesh.is_watertight else "not watertight"
         words = f"{len(mesh.faces):,} triangles, {closed}, area {mesh.area:.3g}, volume {mesh.volume:.3g}"
-        return Contents(words=words, up=self.up, triangles=len(mesh.faces))
+        return Contents(words=words, up=self.up_axis, triangles=len(mesh.faces))

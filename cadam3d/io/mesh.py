@@ -1,12 +1,14 @@
-"""Files of triangle meshes: glb, obj and ply, with vertex colours or a texture.
+"""Files of triangle meshes: glb, obj and ply with vertex colours or a texture, and stl without colours.
 
-All three are written so that other programs show the colours of our renders. glTF multiplies colours with
-light and defines vertex colours as linear (glTF 2.0, sec. 3.9.2), so the material of a glb is unlit
+The first three are written so that other programs show the colours of our renders. glTF multiplies colours
+with light and defines vertex colours as linear (glTF 2.0, sec. 3.9.2), so the material of a glb is unlit
 (``KHR_materials_unlit``) and its vertex colours are converted from sRGB, as 16-bit numbers, which keeps dark
 colours apart. A texture is sRGB in every format. Vertex colours of obj (``v x y z r g b``) and ply (``uchar
-red green blue``) are sRGB by convention.
+red green blue``) are sRGB by convention. An stl is for printers, whose programs take its unit for a
+millimetre, so a world unit becomes 50 of them, and the unit ball is 100 mm wide.
 """
 
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,8 @@ from cadam3d.io.gltf import linear, write_gltf
 from cadam3d.io.ply_tables import header_text
 from cadam3d.io.reading import unusable
 
-FORMATS = ("glb", "obj", "ply")
+FORMATS = ("glb", "obj", "ply", "stl")
+MILLIMETRES = 50.0  # of a world unit in an stl
 # Constants of glTF for the sampling of textures.
 LINEAR, CLAMP = 9729, 33071
 NAME = "cadam3d"
@@ -92,6 +95,20 @@ def write_mesh_ply(path: Path, surface: Surface, *, up: str) -> None:
         temporary.write_bytes(header_text(None, elements) + vertex.tobytes() + face.tobytes())
 
 
+def write_stl(path: Path, surface: Surface, *, up: str) -> None:
+    """Write a binary stl in millimetres, atomically. Raises ``UserError`` if the file cannot be written."""
+    corners = MILLIMETRES * _corners_in_file(surface, up, None)[0][surface.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    records = np.zeros(
+        len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("zero", "<u2")]
+    )
+    records["normal"], records["corners"] = normals / np.maximum(lengths, 1e-30), corners
+    head = f"{NAME} {__version__}".encode("ascii").ljust(80) + struct.pack("<I", len(records))
+    with replacing(path) as temporary:
+        temporary.write_bytes(head + records.tobytes())
+
+
 def write_obj(path: Path, surface: Surface, *, up: str, texture: Texture | None = None) -> list[Path]:
     """Write an obj file, for a texture also its material and picture, and return the paths.
 
@@ -123,7 +140,7 @@ def write_obj(path: Path, surface: Surface, *, up: str, texture: Texture | None 
 
 
 def read_mesh(path: Path) -> Any:
-    """Return the mesh in a file of any of the three formats, as trimesh describes it.
+    """Return the mesh in a file of any of the formats, as trimesh describes it.
 
     Vertices at the same place count as one, because a texture repeats them. Raises ``UserError`` if the file
     cannot be read.

@@ -9,6 +9,7 @@ from hydra.errors import CompactHydraException, MissingConfigException, Override
 from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
+from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import NO_NAME_COMPLAINT, compose, flatten, quote
 from cadam3d.settings.line import key_of
@@ -19,6 +20,7 @@ from cadam3d.settings.options import (
     unknown_option,
     unknown_setting,
 )
+from cadam3d.settings.output import GROUP, writing
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
 # The choice of an option or of a list of options.
@@ -73,6 +75,9 @@ def _unknown_option(error: MissingConfigException, command: str) -> UserError:
         package = f"hydra-{option.partition('_')[0]}-launcher"
         return UserError(f"launcher: {option} is not installed. Try: pip install {package}")
     if group and (options := sorted(error.options or option_names(group))):
+        words = writing(option) if group == GROUP else ""
+        if words:
+            return fail(group, expected=f"one of {'|'.join(options)}", got=option, example=words)
         return unknown_option(group, option, options, command)
     return UserError(f"{option}: no such configuration. Try: cadam3d {command} --help")
 

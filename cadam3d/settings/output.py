@@ -13,6 +13,8 @@ from cadam3d.settings.options import option_class, option_names
 GROUP = "exporter"
 # What render writes of several runs, if the line names no exporter: one picture and one video.
 COMPARING = ("preview", "turntable")
+# What to type for files that only another program writes.
+INSTEAD: dict[str, str] = dict.fromkeys((".blend", ".dae", ".fbx", ".usd", ".usdz"), "for=blender")
 
 
 def exporting(overrides: Sequence[str], folders: Sequence[Path] = ()) -> list[str]:
@@ -38,7 +40,8 @@ def exporting(overrides: Sequence[str], folders: Sequence[Path] = ()) -> list[st
     suffix = suffix_of(name, by_suffix)
     if suffix not in by_suffix and not named and "exporter" not in given:
         expected = f"a file with suffix {'|'.join(by_suffix)}, or a folder"
-        raise fail("output", expected=expected, got=name, example=setting_word("output", f"{name}/"))
+        example = INSTEAD.get(suffix) or setting_word("output", f"{name}/")
+        raise fail("output", expected=expected, got=name, example=example)
     if "exporter" in given:
         value = value_of(given["exporter"])
         named |= set(map(str, value if isinstance(value, list) else [value]))
@@ -50,6 +53,16 @@ def exporting(overrides: Sequence[str], folders: Sequence[Path] = ()) -> list[st
     if setting and (key := f"exporter.{chosen}.{setting}") not in given:
         words.append(f"{key}={suffix.removeprefix('.')}")
     return [*overrides, *words]
+
+
+def writing(kind: str) -> str:
+    """Return the words that choose the exporter of files with the suffix ``.kind``; "" if there is none."""
+    classes = exporter_classes(())
+    suffix = f".{kind.lower()}"
+    for name in exporters_by_suffix(classes).get(suffix, [])[:1]:
+        setting = classes[name].suffix_setting
+        return f"'exporter=[{name}]'" + (f" exporter.{name}.{setting}={kind.lower()}" if setting else "")
+    return ""
 
 
 def exporter_classes(folders: Sequence[Path]) -> dict[str, type[Exporter]]:

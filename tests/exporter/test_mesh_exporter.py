@@ -137,3 +137,20 @@ def test_wrong_values_name_their_key(key, value):
 def test_a_ply_has_no_texture():
     with pytest.raises(UserError, match=r"exporter\.mesh\.texture: .*Try: exporter\.mesh\.format=glb"):
         MeshExporter(**{**SETTINGS, "format": "ply", "texture": 512})
+
+
+def test_an_stl_stands_on_the_bed_of_a_printer_in_millimetres(tmp_path):
+    [path] = export(tmp_path, format="stl", up=None)
+    mesh = read_mesh(path)
+    assert mesh.is_watertight
+    assert np.abs(mesh.extents - 100 * 0.5).max() < 15  # a ball of radius 0.5 and its blur
+    assert "without colours" in MeshExporter(**{**SETTINGS, "format": "stl"}).losses(3)
+    # The head of a tall cone is at +z.
+    cone = two_coloured_ball()
+    cone.means[:, :2] *= (0.5 - cone.means[:, 2:]).clamp_min(0.05)
+    MeshExporter(**{**SETTINGS, "format": "stl", "up": None}).export(cone, never_renders, tmp_path)
+    corners = trimesh.load_mesh(path).vertices
+    top, bottom = (
+        np.ptp(corners[half][:, :2], axis=0).max() for half in (corners[:, 2] > 10, corners[:, 2] < -10)
+    )
+    assert top < 0.8 * bottom
