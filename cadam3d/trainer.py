@@ -23,6 +23,7 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.memory import is_out_of_memory
 from cadam3d.core.rendering import RenderFn, RenderOutput
 from cadam3d.densifier.base import Densifier, GradientSignal
+from cadam3d.densifier.ghosts import ghosts
 from cadam3d.densifier.refine import Refine, RefinePlan
 from cadam3d.exposure import Exposure
 from cadam3d.guidance.base import Guidance
@@ -182,7 +183,7 @@ class Trainer:
     def _refine(self, state: TrainState, step: int) -> RefineReport | None:
         """Grow, prune and reset opacities if the schedule says so after step number ``step`` (from 1).
 
-        With ``refine.last_max_scale``, a last step that does not refine still prunes. A refinement is decided
+        A last step that does not refine may still prune (``Refine.prunes_at``). A refinement is decided
         first and then applied to all three owners of rows: Gaussians, optimizer moments and densifier state.
         One that would exceed ``max_gaussians`` changes nothing except ``state.refused``.
         """
@@ -200,7 +201,7 @@ class Trainer:
         if refines:
             plan = self.densifier.plan(seen, state.gaussians, step, self.refine, generator)
         elif prunes:
-            plan = self.refine.plan(state.gaussians, plan.is_selected, step, generator)
+            plan = self.refine.plan(before, plan.is_selected, step, generator, self._ghosts(before))
         state.refused = self.refine.exceeds(plan)
         if state.refused:
             generator.set_state(draws_before)
@@ -229,6 +230,13 @@ class Trainer:
             population=Population(gaussians=before, is_selected=plan.is_selected, scores=scores),
             edit=plan.edit,
         )
+
+    def _ghosts(self, gaussians: Gaussians) -> Tensor | None:
+        """Return the mask of Gaussians that the last pruning removes as ghosts, or None if it keeps them."""
+        if not self.refine.prunes_ghosts:
+            return None
+        assert self.refine.last_min_alpha is not None
+        return ghosts(gaussians, self.rasterizer.render, self.refine.last_min_alpha)
 
     def start(self, prompt: str, initializer: Initializer, seed: int, device: torch.device) -> TrainState:
         """Return the state before the first step; every later random draw descends from ``seed``."""

@@ -290,6 +290,18 @@ def test_the_last_pruning_leaves_no_large_gaussian_whether_the_last_step_refines
         assert last.pruned > 0
 
 
+def test_the_last_pruning_removes_ghosts_and_nothing_else(tmp_path, monkeypatch):
+    monkeypatch.setattr("cadam3d.trainer.ghosts", lambda gaussians, *_: gaussians.means[:, 0] > 0)
+    trainer, state = make(["refine.end=5", "refine.min_opacity=0", "refine.max_scale=null"])
+    recorder = Recorder()
+    assert go(replace(trainer, callbacks=[recorder]), state, tmp_path) is Outcome.FINISHED
+    last = recorder.refinements[-1]
+    assert (last.step, last.selected) == (8, 0)
+    kept = last.population.gaussians.means[last.population.gaussians.means[:, 0] <= 0]
+    assert 0 < len(kept) < last.before
+    assert torch.equal(state.gaussians.means.detach(), kept)
+
+
 def test_a_stop_signal_ends_the_run_after_the_current_step(tmp_path):
     trainer, state = make()
     answers = iter([False, False, True])

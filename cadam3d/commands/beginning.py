@@ -79,7 +79,7 @@ def describe_schedule(trainer: Trainer) -> str:
     refine, densifier = trainer.refine, trainer.densifier
     resets = refine.resets if densifier.resets else range(0)
     parts = [_counted("refinement", refine.refinements), _counted("opacity reset", resets)]
-    parts += ["a last pruning"] if refine.last_max_scale is not None else []
+    parts += ["a last pruning"] if refine.prunes_at(refine.steps) else []
     text = f"{', '.join(parts)}."
     first = densifier.grows_from
     if first is not None and not any(step >= first for step in refine.refinements[-1:]):

@@ -50,6 +50,7 @@ class Refine:
     min_opacity: float  # in [0, 1)
     max_scale: float | None  # > 0
     last_max_scale: float | None  # > 0
+    last_min_alpha: float | None  # in [0, 1]
     prune_from: int  # step
     reset_interval: int | None  # steps
     reset_from: int  # step
@@ -70,6 +71,7 @@ class Refine:
         require_range("refine.min_opacity", self.min_opacity, low=0, below=1)
         unless_none(require_range, "refine.max_scale", self.max_scale, above=0)
         unless_none(require_range, "refine.last_max_scale", self.last_max_scale, above=0)
+        unless_none(require_range, "refine.last_min_alpha", self.last_min_alpha, low=0, high=1)
         require_whole("refine.prune_from", self.prune_from, low=0)
         unless_none(require_whole, "refine.max_gaussians", self.max_gaussians, low=1)
         self._check_reset()
@@ -125,7 +127,15 @@ class Refine:
 
     def prunes_at(self, step: int) -> bool:
         """Return whether step number ``step`` (from 1) ends with the last pruning of the run."""
-        return self.last_max_scale is not None and step == self.steps
+        return step == self.steps and (self.last_max_scale is not None or self.prunes_ghosts)
+
+    @property
+    def prunes_ghosts(self) -> bool:
+        """Return whether the last pruning removes ghosts, unless the last step refines.
+
+        In fewer steps than ``recovery``, no Gaussian becomes solid, so all of them would look like ghosts.
+        """
+        return self.last_min_alpha is not None and self.steps >= self.recovery
 
     def resets_at(self, step: int) -> bool:
         """Return whether step number ``step`` (from 1) ends with an opacity reset, after any refinement."""

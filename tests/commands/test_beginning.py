@@ -16,7 +16,8 @@ def line(*words: str) -> str:
 
 
 def test_the_default_run_grows_and_resets():
-    assert line() == "6 refinements (steps 150 to 400, every 50), 1 opacity reset (step 300)."
+    expected = "6 refinements (steps 150 to 400, every 50), 1 opacity reset (step 300), a last pruning."
+    assert line() == expected
 
 
 @pytest.mark.parametrize("name", ["none", "mcmc", "random", "random_annealed", "cadam_no_reset"])

@@ -25,6 +25,7 @@ def refine(**changes) -> Refine:
     usual = {
         "steps": 20_000,
         "last_max_scale": None,
+        "last_min_alpha": None,
         "start": 100,
         "end": 3000,
         "interval": 100,
@@ -181,6 +182,11 @@ def test_the_last_pruning_is_at_the_last_step_only():
     assert not refine(steps=450).prunes_at(450)
 
 
+def test_ghosts_are_pruned_after_the_last_step_of_runs_in_which_gaussians_become_solid():
+    assert [step for step in range(1, 451) if refine(steps=450, last_min_alpha=0.3).prunes_at(step)] == [450]
+    assert not refine(steps=95, last_min_alpha=0.3).prunes_at(95)
+
+
 @pytest.mark.parametrize("name", ["means", "log_scales", "opacity_logits"])
 def test_rows_with_nan_are_pruned(name):
     scene = gaussians(4)
@@ -276,6 +282,7 @@ def test_gaussians_moments_and_densifier_state_stay_in_step_through_many_edits(d
         ("min_opacity", 1.0),
         ("max_scale", 0.0),
         ("last_max_scale", 0.0),
+        ("last_min_alpha", 1.1),
         ("reset_interval", 0),
         ("reset_value", 1.0),
         ("recovery", 0),

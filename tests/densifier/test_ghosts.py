@@ -1,0 +1,48 @@
+"""Laws of ghosts: what is alone in empty space goes, what belongs to an object stays."""
+
+import torch
+
+from cadam3d.core.gaussians import Gaussians, concatenate
+from cadam3d.densifier.ghosts import ghosts
+from cadam3d.rasterizer.reference import ReferenceRasterizer
+
+RENDER = ReferenceRasterizer().render
+
+
+def at(means: torch.Tensor, opacity: float, scale: float = 0.06) -> Gaussians:
+    n = len(means)
+    return Gaussians(
+        means=means,
+        log_scales=torch.full((n, 3), scale).log(),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1),
+        opacity_logits=torch.full((n,), opacity).logit(),
+        sh=torch.zeros(n, 1, 3),
+    )
+
+
+def ball(opacity: float, count: int = 150, radius: float = 0.3) -> Gaussians:
+    direction = torch.nn.functional.normalize(
+        torch.randn(count, 3, generator=torch.Generator().manual_seed(0)), dim=1
+    )
+    return at(radius * direction, opacity)
+
+
+def test_faint_gaussians_beside_a_solid_object_are_ghosts_and_the_object_is_none():
+    faint = at(torch.tensor([[0.7, 0.0, 0.0], [0.0, -0.6, 0.2], [0.0, 0.0, 0.65]]), 0.1)
+    marked = ghosts(concatenate([ball(0.8), faint]), RENDER, 0.3)
+    assert marked.nonzero()[:, 0].tolist() == [150, 151, 152]
+
+
+def test_a_small_solid_part_beside_the_object_is_no_ghost():
+    solid = at(torch.tensor([[0.7, 0.0, 0.0]]), 0.95)
+    assert not ghosts(concatenate([ball(0.8), solid]), RENDER, 0.3).any()
+
+
+def test_a_transparent_object_is_no_ghost():
+    assert not ghosts(ball(0.02), RENDER, 0.3).any()
+
+
+def test_a_gaussian_that_no_view_shows_is_no_ghost():
+    hidden = at(torch.tensor([[0.0, 0.0, 50.0]]), 0.5)
+    assert not ghosts(concatenate([ball(0.8), hidden]), RENDER, 0.3).any()
+    assert ghosts(at(torch.zeros(0, 3), 0.5), RENDER, 0.3).shape == (0,)
