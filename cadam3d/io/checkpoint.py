@@ -17,6 +17,7 @@ from torch import Tensor
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import remove_leftovers, replacing
+from cadam3d.io.pickled import require_finite
 from cadam3d.io.reading import open_regular
 from cadam3d.io.run_folder import checkpoint_step, checkpoints
 
@@ -66,6 +67,7 @@ def load_checkpoint(path: Path) -> Any:
     try:
         with open_regular(path) as file:
             _require_sound(file)
+            require_finite(file)
             file.seek(0)
             content = torch.load(file, map_location="cpu", weights_only=True)
         _require_plain(content)

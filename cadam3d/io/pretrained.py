@@ -20,6 +20,8 @@ from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.core.memory import is_out_of_memory
 from cadam3d.io.jsonl import read_json
+from cadam3d.io.pickled import require_finite
+from cadam3d.io.reading import open_regular
 
 INDEX = "model_index.json"
 VOCABULARY = "vocabulary.json"  # in the folder of a model that knows only some words
@@ -226,6 +228,9 @@ def read_model(kind: Any, where: str | Path, refuse: Callable[[str], UserError],
     if kind.__module__.startswith("transformers."):
         options["trust_remote_code"] = False
     with refused_by(refuse, f"its {kind.__name__} cannot be loaded"):
+        for file in Path(where, options.get("subfolder", "")).glob("*.bin"):
+            with open_regular(file) as opened:
+                require_finite(opened)
         return kind.from_pretrained(where, local_files_only=Path(where).is_dir(), **options)
 
 
@@ -309,6 +314,8 @@ def read_tensors(key: str, file: Path) -> Mapping[str, Tensor]:
     try:
         if file.suffix == ".safetensors":
             return load_file(file)
+        with open_regular(file) as opened:
+            require_finite(opened)
         try:
             content = torch.load(file, map_location="cpu", weights_only=True, mmap=True)
         except RuntimeError:  # an old format that torch cannot map
