@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cadam3d.core.checks import fail
+from cadam3d.core.checks import fail, require
 from cadam3d.core.errors import UserError
 from cadam3d.core.memory import is_out_of_memory
 from cadam3d.io.jsonl import read_json
@@ -49,6 +49,12 @@ CLASSES = {
 # Keys of a part's configuration that would load further code or other weights.
 LOADING = ("attn_implementation", "quantization_config")
 EXTRA = ("diffusers", "transformers", "safetensors")
+# The weight files of a network on the hub, or their list if there are several, with the name of a variant.
+WEIGHTS = tuple(
+    f"{stem}.{ending}"
+    for stem in ("diffusion_pytorch_model", "model")
+    for ending in ("{}.safetensors", "safetensors.index.{}.json")
+)
 DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
 
 
@@ -142,8 +148,25 @@ class Pretrained:
                 self._check_vocabulary(name, len(loaded))
             return loaded
         self.config(name)
-        options |= {"dtype": dtype, "variant": self.source.variant}
+        options |= {"dtype": dtype, "variant": self.variant(name)}
         return read_network(kind, self.where, partial(self._unusable, what), **options)
+
+    def variant(self, name: str) -> str | None:
+        """Return the variant of a network's weight files: None if it has only plain ones, as in diffusers.
+
+        Raises ``UserError`` if no part of a folder has files of the variant.
+        """
+        wanted, folder = self.source.variant, Path(self.where)
+        if wanted is None:
+            return None
+        if not folder.is_dir():
+            names = (f"{name}/{file.format(wanted)}" for file in WEIGHTS)
+            has = any(fetch_file(self.where, file, self.revision, True)[0] for file in names)
+            return wanted if has else None
+        parts = {file.parent.name for file in folder.glob(f"*/*.{wanted}[.-]*")}
+        key = f"{self.source.key}.variant"
+        require(bool(parts), key, expected=f"a variant of {folder}", got=wanted, example=f"{key}=null")
+        return wanted if name in parts else None
 
     def config(self, name: str) -> dict[str, Any]:
         """Return the configuration of one part, without loading its weights."""

@@ -165,8 +165,8 @@ def with_ldm_unet(found: Pretrained) -> Pretrained:
 
 def _unet_file(found: Pretrained) -> Path:
     """Return the file with the tensors of the UNet of a model in the layout of diffusers."""
-    variant = f".{found.source.variant}" if found.source.variant else ""
-    stem = f"unet/diffusion_pytorch_model{variant}"
+    variant = found.variant("unet")
+    stem = f"unet/diffusion_pytorch_model{f'.{variant}' if variant else ''}"
     reason = "no such file"
     for name in (f"{stem}.safetensors", f"{stem}.bin"):
         file = Path(found.where) / name

@@ -53,6 +53,40 @@ def refusal(kind):
     return kind("no", response=client.Response(404, request=client.Request("GET", "hub")))
 
 
+@pytest.fixture(scope="module")
+def mixed(model, tmp_path_factory):
+    """A model of which only the UNet and the text encoder have files of the variant fp16."""
+    import diffusers
+
+    folder = tmp_path_factory.mktemp("mixed") / "model"
+    pipeline = diffusers.StableDiffusionPipeline.from_pretrained(model)
+    pipeline.save_pretrained(folder, variant="fp16")
+    plain, vae = "diffusion_pytorch_model.safetensors", folder / "vae"
+    (vae / "diffusion_pytorch_model.fp16.safetensors").rename(vae / plain)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["unet", "vae", "text_encoder"])
+def test_a_part_without_files_of_the_variant_has_its_plain_ones(name, model, mixed, monkeypatch):
+    wanted = source(path=str(model)).find(KINDS, OTHERS).part(name, torch.float32)
+    found = source(path=str(mixed), variant="fp16").find(KINDS, OTHERS)
+    for key, tensor in found.part(name, torch.float32).state_dict().items():
+        assert torch.equal(tensor, wanted.state_dict()[key])
+
+    def fetch(where, file, revision, can_ask):
+        return (mixed / file if (mixed / file).is_file() else None), "", can_ask
+
+    monkeypatch.setattr(pretrained, "fetch_file", fetch)
+    remote = ModelSource("prior", None, ["one/model"], None, "fp16")
+    assert pretrained.Pretrained(remote, "one/model", None, mixed, {}).variant(name) == found.variant(name)
+
+
+def test_a_variant_that_no_part_has_is_refused(mixed):
+    found = source(path=str(mixed), variant="fp61").find(KINDS, OTHERS)
+    with pytest.raises(UserError, match=r"prior\.variant: expected a variant of .*, got 'fp61'"):
+        found.part("unet", torch.float32)
+
+
 def test_a_folder_takes_precedence_over_ids_and_needs_no_hub(model, hub):
     found = source(path=str(model)).find(KINDS, OTHERS)
     assert found.where == str(model)
