@@ -8,6 +8,7 @@ import pytest
 from cadam3d.core.errors import UserError
 from cadam3d.prior.shapes.grammar import EXAMPLE, MAX_OBJECTS, Phrase, Sentence, parse
 from cadam3d.prior.shapes.objects import ALIASES, known_objects, known_primitives
+from cadam3d.prior.shapes.scene import build
 from cadam3d.prior.shapes.words import (
     COLOURS,
     NUMBERS,
@@ -82,6 +83,34 @@ def test_between_takes_two_objects_and_chains_nest_to_the_right() -> None:
     assert between == Sentence(Phrase("sphere", ("white",)), "between", (Sentence(red), Sentence(blue)))
     chain = parse("a red cube on a blue cube on a table")
     assert chain == Sentence(red, "on", (Sentence(blue, "on", (Sentence(Phrase("table")),)),))
+
+
+def test_relations_group_as_in_english() -> None:
+    def pair(left: Sentence | str, relation: str, right: Sentence | str) -> Sentence:
+        others = right if isinstance(right, Sentence) else Sentence(Phrase(right))
+        return Sentence(left if isinstance(left, Sentence) else Phrase(left), relation, (others,))
+
+    stack, rank = pair("cone", "on", "cube"), pair("sphere", "in front of", "pyramid")
+    assert parse("a cone on a cube next to a ball in front of a pyramid") == pair(stack, "next to", rank)
+    assert parse("a ball in front of a pyramid and a cone on a cube") == pair(rank, "next to", stack)
+    assert parse("a cone on a cube behind a tree on a box") == pair(
+        stack, "behind", pair("tree", "on", "box")
+    )
+    assert parse("a ball under a table next to a chair") == pair(
+        pair("sphere", "under", "table"), "next to", "chair"
+    )
+    assert parse("a cube and a ball and a cone") == pair("cube", "next to", pair("sphere", "next to", "cone"))
+
+
+def test_what_stands_on_an_object_of_a_group_stands_over_its_middle() -> None:
+    scene = build("a cone on a cube next to a ball in front of a pyramid")
+    place = {kind.name: at.tolist() for (kind, _), at in zip(scene.kinds, scene.centres, strict=True)}
+    cone, cube, ball, pyramid = (place[name] for name in ("frustum", "box", "ball", "pyramid"))
+    assert cone[:2] == pytest.approx(cube[:2], abs=1e-6)
+    assert cone[2] > cube[2]
+    assert ball[1] > cube[1]
+    assert ball[0] > pyramid[0]
+    assert len(set(scene.paints[:, 0].tolist())) == 4, "open colours differ"
 
 
 def test_nouns_in_two_words_and_words_about_pictures_are_read() -> None:

@@ -1,8 +1,12 @@
-"""Parser of prompts: noun phrases joined by relations, read from left to right.
+"""Parser of prompts: noun phrases joined by relations, which group as in English.
 
-sentence = phrase | phrase relation sentence | phrase "between" phrase "and" sentence
+sentence = phrase | sentence relation sentence | sentence "between" phrase "and" sentence
 relation = "on" | "under" | "above" | "next to" | "in front of" | "behind" | "and", which means next to
 phrase   = (article | number | size | colour | "and" | pattern)* noun
+
+What is on, under or above an object belongs to it most closely, then what is in front of it or behind it,
+then what is beside it. So "a cone on a cube next to a ball in front of a pyramid" is (a cone on a cube) next
+to (a ball in front of a pyramid). Equally close relations group to the right.
 """
 
 import math
@@ -34,6 +38,8 @@ MOST_NAMED = 20  # unknown words in one message
 EXAMPLE = "a red and yellow checkered torus"
 MAX_COLOURS = 2
 MAX_OBJECTS = 200  # of one prompt; sentences nest, and Python limits how deeply
+# How closely a relation binds; those beside one another bind least.
+CLOSENESS = {"on": 2, "under": 2, "above": 2, "in front of": 1, "behind": 1, "next to": 0, "between": 0}
 SIMILAR = 0.78  # of difflib's ratio, in [0, 1]; one letter of five may differ, but not one of four
 
 
@@ -51,9 +57,9 @@ class Phrase:
 
 @dataclass(frozen=True)
 class Sentence:
-    """A phrase and its relation to the rest of the sentence: "a cube on (a ball on a table)"."""
+    """A phrase or a group, and its relation to the rest of the sentence: "a cube on (a ball on a table)"."""
 
-    phrase: Phrase
+    phrase: "Phrase | Sentence"
     relation: str | None = None
     others: tuple["Sentence", ...] = ()  # two for "between", one for other relations
 
@@ -80,17 +86,18 @@ class _Reader:
     def __init__(self, key: str, prompt: str, words: list[str]) -> None:
         self.key, self.prompt, self.words, self.position = key, prompt, words, 0
 
-    def sentence(self) -> Sentence:
-        phrase = self.phrase()
-        relation = self.relation()
-        if relation is None:
-            return Sentence(phrase)
-        if relation != "between":
-            return Sentence(phrase, relation, (self.sentence(),))
-        first = Sentence(self.phrase())
-        if not self.take("and"):
-            raise self.fail("two objects joined by 'and' after 'between'")
-        return Sentence(phrase, relation, (first, self.sentence()))
+    def sentence(self, closeness: int = 0) -> Sentence:
+        """Read as far as the relations have at least this closeness."""
+        found = Sentence(self.phrase())
+        while (relation := self.relation(closeness)) is not None:
+            others: list[Sentence] = []
+            if relation == "between":
+                others.append(Sentence(self.phrase()))
+                if not self.take("and"):
+                    raise self.fail("two objects joined by 'and' after 'between'")
+            others.append(self.sentence(CLOSENESS[relation]))
+            found = Sentence(found if found.relation else found.phrase, relation, tuple(others))
+        return found
 
     def phrase(self) -> Phrase:
         start = self.position
@@ -125,11 +132,15 @@ class _Reader:
             raise self.fail(f"at most {MAX_COLOURS} colours for one object")
         return tuple(colours)
 
-    def relation(self) -> str | None:
-        """Step over the relation at the cursor and return its name, or None at the end of the prompt."""
+    def relation(self, closeness: int) -> str | None:
+        """Step over the relation at the cursor and return its name; None if none is as close."""
+        before = self.position
         for words, name in RELATIONS:
             if self.take(*words):
-                return name
+                if CLOSENESS[name] >= closeness:
+                    return name
+                self.position = before
+                return None
         if self.peek() is not None:
             raise self.fail(f"a relation such as 'on' or 'next to' before {self.peek()!r}")
         return None

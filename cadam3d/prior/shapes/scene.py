@@ -1,6 +1,8 @@
 """From a sentence to a scene: objects are painted, placed and scaled to fit into the unit ball."""
 
+import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -98,7 +100,7 @@ def build(prompt: str, key: str = "prompt") -> Scene:
 
 def assemble(sentence: Sentence) -> tuple[Part, ...]:
     """Paint, place and scale all objects of a sentence."""
-    return _fit(_arrange(sentence, 0).parts)
+    return _fit(_arrange(sentence, itertools.count()).parts)
 
 
 def compile_scene(parts: tuple[Part, ...]) -> Scene:
@@ -213,10 +215,11 @@ def _paint(item: Thing, phrase: Phrase, index: int) -> tuple[Part, ...]:
 # --- places
 
 
-def _arrange(sentence: Sentence, index: int) -> _Placed:
-    """Place all objects of a sentence; ``index`` counts phrases, so that open colours differ."""
-    first = _place(sentence.phrase, index)
-    others = [_arrange(other, index + 1 + number) for number, other in enumerate(sentence.others)]
+def _arrange(sentence: Sentence, indices: Iterator[int]) -> _Placed:
+    """Place all objects of a sentence; ``indices`` count phrases, so that open colours differ."""
+    group = sentence.phrase
+    first = _place(group, next(indices)) if isinstance(group, Phrase) else _arrange(group, indices)
+    others = [_arrange(other, indices) for other in sentence.others]
     if sentence.relation is None:
         return first
     if sentence.relation == "between":
