@@ -11,9 +11,9 @@ from typing import Any
 from cadam3d.api.asset import Asset, load
 from cadam3d.api.guest import as_guest, literal, require_free
 from cadam3d.callback.base import Callback
-from cadam3d.commands.control import StopOnSignal
 from cadam3d.commands.opened import find_run
 from cadam3d.commands.train import optimise
+from cadam3d.core.signals import StopOnSignal
 from cadam3d.io.records import read_config, read_metrics, read_summary
 from cadam3d.io.run_folder import CONFIG, REPORT, RUN_FOLDER, shown
 from cadam3d.launch import completing, prepare

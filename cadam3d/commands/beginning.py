@@ -95,18 +95,17 @@ def _counted(noun: str, steps: range) -> str:
 
 
 @contextmanager
-def begun(cfg: DictConfig, call: Call, folder: Path) -> Iterator[str]:
-    """Write the settings into the folder of a run, and its log while the block runs; yield the settings.
+def begun(cfg: DictConfig, call: Call, folder: Path) -> Iterator[None]:
+    """Write the settings into the folder of a run, and its log while the block runs.
 
     All files appear together, or none of them does. Raises ``UserError`` if one cannot be written.
     """
     remove_leftovers(folder)
-    config_text = OmegaConf.to_yaml(cfg, resolve=True)
     texts = {
         HYDRA_CONFIG: OmegaConf.to_yaml(cfg),
         HYDRA_SETTINGS: OmegaConf.to_yaml({"hydra": call.hydra}),
         OVERRIDES: OmegaConf.to_yaml(call.hydra.overrides.task),
-        CONFIG: config_text,
+        CONFIG: OmegaConf.to_yaml(cfg, resolve=True),
     }
     with logged_to(folder / LOG):
         with ExitStack() as files:
@@ -116,7 +115,7 @@ def begun(cfg: DictConfig, call: Call, folder: Path) -> Iterator[str]:
         # This is for single runs: a sweep locks the folders of its jobs and passes the locks on.
         if INHERITED not in os.environ:
             link(Path(LATEST), folder)
-        yield config_text
+        yield
 
 
 @contextmanager

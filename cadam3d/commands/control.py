@@ -5,13 +5,10 @@ The requests are signals, and files (``io/live.py``), which the page of ``cadam3
 
 import logging
 import shlex
-import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
@@ -22,8 +19,6 @@ from cadam3d.io.run_folder import LIVE_PAUSE, SAVED, checkpoint_name, saved_name
 from cadam3d.state import TrainState
 
 LOOK_SECONDS = 0.25  # between two looks at the folder
-# Signals that arrive within this time of each other count as one.
-TOGETHER_SECONDS = 1.0
 
 
 @dataclass
@@ -88,38 +83,3 @@ class Control:
             say(f"\nWarning: not saved: {error}", logging.WARNING)
         else:
             say(f"\nSaved {shown(folder / saved_name(step))}")
-
-
-class StopOnSignal:
-    """Handles signals: after the first one the loop stops and saves, a later one stops it at once.
-
-    Signals within ``TOGETHER_SECONDS`` count as one, because a scheduler sends its signal to a process and
-    also to its parent, which passes it on.
-    """
-
-    def __init__(self, numbers: Sequence[int]) -> None:
-        self.received: int | None = None
-        self._numbers = numbers
-        self._received_at = 0.0
-        self._previous: dict[int, Any] = {}
-
-    def __enter__(self) -> "StopOnSignal":
-        for number in self._numbers:
-            self._previous[number] = signal.signal(number, self._handle)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def __call__(self) -> bool:
-        """Return whether a signal has arrived."""
-        return self.received is not None
-
-    def _handle(self, number: int, _frame: FrameType | None) -> None:
-        if self.received is not None:
-            if time.monotonic() - self._received_at < TOGETHER_SECONDS:
-                return
-            raise KeyboardInterrupt
-        self.received, self._received_at = number, time.monotonic()
-        say("\nStopping as soon as everything is saved; interrupt again to stop at once.", logging.WARNING)

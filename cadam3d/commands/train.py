@@ -19,16 +19,16 @@ from cadam3d.commands.beginning import (
     note_memory,
     run_context,
 )
-from cadam3d.commands.control import Control, StopOnSignal
+from cadam3d.commands.control import Control
 from cadam3d.commands.finishing import Results, measure_memory, print_result, summarize
 from cadam3d.commands.resuming import keep_start, start_or_resume
 from cadam3d.core.checks import require_whole
 from cadam3d.core.console import say
 from cadam3d.core.device import resolve_device
+from cadam3d.core.signals import StopOnSignal
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.declarations import write_declarations
 from cadam3d.io.occupied import occupied
-from cadam3d.io.records import read_metrics
 from cadam3d.report import write_report
 from cadam3d.settings.compose import Call
 
@@ -71,12 +71,11 @@ def optimise(
         schedule = describe_schedule(trainer)
         say(f"Schedule: {schedule}")
 
-        with begun(cfg, call, folder) as config_text:
+        with begun(cfg, call, folder):
             log.info("prompt %r, seed %d, on %s, from step %d", cfg.prompt, cfg.seed, device, state.step)
             log.info("schedule: %s", schedule)
             log.info("rasterizer=%s; %s", backend.name, backend.reason or "nothing faster is known here")
-            charts = [*trainer.densifier.charts(), *trainer.guidance.charts()]
-            write_declarations(folder, charts)
+            write_declarations(folder, [*trainer.densifier.charts(), *trainer.guidance.charts()])
             context = run_context(cfg.prompt, trainer, state, folder)
             with stop, Control(folder, state, stop, partial(trainer.wait, context, state)) as control:
                 outcome = trainer.train(state, embedding, context, control)
@@ -87,11 +86,5 @@ def optimise(
                 results.write(context, state.gaussians.detach(), start, summary)
                 for callback in trainer.callbacks:
                     callback.on_result(context, summary)
-                write_report(
-                    folder,
-                    summary=summary,
-                    metrics=read_metrics(folder),
-                    config_text=config_text,
-                    charts=charts,
-                )
+                write_report(folder)
     return folder, summary

@@ -4,29 +4,14 @@ The functions here import what they need when they are called: matplotlib, SciPy
 second to load, and a command that writes no report should not wait for them.
 """
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-from cadam3d.core.chart import Chart
 
 
-def write_report(
-    folder: Path,
-    *,
-    summary: Mapping[str, Any],
-    metrics: Sequence[Mapping[str, Any]],
-    config_text: str,
-    charts: Sequence[Chart] = (),
-) -> Path:
-    """Write ``report.html`` and ``charts.json`` of the run in ``folder`` and return the path of the page.
-
-    ``summary`` is the content of ``summary.json``, ``metrics`` the lines of ``metrics.jsonl``, and ``charts``
-    the declarations of the run's densifier and objective.
-    """
+def write_report(folder: Path) -> Path:
+    """Write ``report.html`` of the run in ``folder`` from its files, and return the path of the page."""
     from cadam3d.report.run_page import write
 
-    return write(folder, summary=summary, metrics=metrics, config_text=config_text, charts=charts)
+    return write(folder)
 
 
 def write_sweep(folder: Path, baseline: str | None = None) -> Path:

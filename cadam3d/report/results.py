@@ -6,12 +6,11 @@ Gaussians and see the same views and noise, so settings are compared within cell
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from cadam3d.core.number import COUNT, Number
@@ -26,6 +25,7 @@ from cadam3d.sweep.folder import UNFINISHED, Row, load, numbers_of
 WITH_ASSET = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.OUT_OF_MEMORY)
 ARM, PREFIX = "densifier", "densifier."
 SEED, PROMPT, NOISE, GUIDANCE, RECIPE = "seed", "prompt", "noise", "guidance", "experiment"
+BASIC = (PROMPT, SEED, NOISE)  # axes of every cell
 
 
 @dataclass(frozen=True)
@@ -67,19 +67,12 @@ class Cell:
 
 
 @dataclass(frozen=True, kw_only=True)
-class JobResult:
-    """One job with the numbers it ended with."""
+class JobResult(Row):
+    """One job with the numbers it ended with. Without a grid, its arm has the name of its densifier."""
 
-    folder: Path
     setting: ArmSetting
     is_standard: bool  # every threshold has the value of the shipped configuration
     cell: Cell
-    outcome: str
-    message: str  # the reason of a failure; empty otherwise
-    grows: bool  # whether its densifier may add Gaussians
-    seconds: float | None
-    objective: str  # the option of ``guidance`` it ran with; empty if that is not known
-    category: str  # of its prompt; empty if it has none
     # The numbers of its asset, what their metrics have declared about them, and those that have a record of
     # how they were measured; see numbers_of.
     numbers: Mapping[str, float] = field(repr=False)
@@ -87,14 +80,24 @@ class JobResult:
     scores: Mapping[str, Score] = field(repr=False)
 
     @property
-    def arm(self) -> str:
-        """Return the arm of its setting."""
-        return self.setting.arm
-
-    @property
     def count(self) -> float:
         """Return the number of Gaussians at the end; 0 if it is unknown."""
         return self.numbers.get(COUNT.name, 0.0)
+
+    @property
+    def seconds(self) -> float | None:
+        """Return the time of training; None if it is not known."""
+        return number(self.summary.get("seconds"))
+
+    @property
+    def grows(self) -> bool:
+        """Return whether its densifier may add Gaussians."""
+        return self.summary.get("grows") is not False
+
+    @property
+    def objective(self) -> str:
+        """Return the option of ``guidance`` it ran with; empty if that is not known."""
+        return str(self.swept.get(GUIDANCE) or self.summary.get(GUIDANCE) or "")
 
     @property
     def is_measured(self) -> bool:
@@ -119,63 +122,40 @@ def read(sweep_folder: Path) -> list[JobResult]:
     of the cells. A key that only differs between arms belongs to the arm. Raises ``UserError`` if
     the folder holds no sweep.
     """
-    jobs = [(row, _overrides(row)) for row in load(sweep_folder)]
-    of_arms: dict[str, list[Mapping[str, Any]]] = {}
-    for row, overrides in jobs:
-        of_arms.setdefault(_arm(row, overrides), []).append(overrides)
+    rows = [replace(row, arm=row.arm or _densifier(row) or "default") for row in load(sweep_folder)]
+    of_arms: dict[str, list[Row]] = {}
+    for row in rows:
+        of_arms.setdefault(row.arm, []).append(row)
     varied = {arm: _varied(members) for arm, members in of_arms.items()}
-    axes = list(dict.fromkeys(key for keys in varied.values() for key in keys if not key.startswith(PREFIX)))
-    return [_result(row, overrides, varied[_arm(row, overrides)], axes) for row, overrides in jobs]
+    axes = [key for keys in varied.values() for key in keys if not key.startswith(PREFIX)]
+    return [_result(row, varied[row.arm], axes) for row in rows]
 
 
-def _overrides(row: Row) -> dict[str, Any]:
-    """Return the overrides of a job without settings that come with its prompt.
-
-    Those belong to the prompt, and arms without such a setting are compared too.
-    """
-    pairs = (_pair(str(line)) for line in row.overrides)
-    return {key: value for key, value in pairs if key not in row.brought}
+def _densifier(row: Row) -> str:
+    return str(row.swept.get(ARM) or row.summary.get(ARM, ""))
 
 
-def _densifier(row: Row, overrides: Mapping[str, Any]) -> str:
-    return str(overrides.get(ARM, row.summary.get(ARM, "")))
-
-
-def _arm(row: Row, overrides: Mapping[str, Any]) -> str:
-    """Return the arm of a job. Without a grid it has no name and is then the densifier."""
-    return row.arm or _densifier(row, overrides) or "default"
-
-
-def _result(row: Row, overrides: Mapping[str, Any], varied: Sequence[str], axes: Sequence[str]) -> JobResult:
-    shipped = _shipped(_densifier(row, overrides))
-    known, numbers, scores = numbers_of(row)
-    given = {key.removeprefix(PREFIX): value for key, value in overrides.items() if key.startswith(PREFIX)}
-    thresholds = [key.removeprefix(PREFIX) for key in varied if key.startswith(PREFIX)]
+def _result(row: Row, varied: Sequence[str], axes: Sequence[str]) -> JobResult:
+    shipped = _shipped(_densifier(row))
+    known = {key: row.swept.get(key, row.summary.get(key, "")) for key in BASIC}
+    known |= {key: row.swept.get(key) for key in axes}
+    thresholds = {key: _threshold(row.swept.get(key)) for key in varied if key.startswith(PREFIX)}
+    declared, numbers, scores = numbers_of(row)
     return JobResult(
-        folder=row.folder,
+        **vars(row),
         setting=ArmSetting(
-            _arm(row, overrides),
-            tuple((key, _threshold(given.get(key, shipped.get(key)))) for key in thresholds),
+            row.arm, tuple((key.removeprefix(PREFIX), value) for key, value in thresholds.items())
         ),
-        is_standard=all(_threshold(shipped.get(key)) == _threshold(value) for key, value in given.items()),
-        cell=_cell(row, overrides, axes),
-        outcome=str(row.outcome),
-        message=str(row.summary.get("message") or ""),
-        grows=row.summary.get("grows") is not False,
-        seconds=number(row.summary.get("seconds")),
-        objective=str(overrides.get(GUIDANCE) or row.summary.get(GUIDANCE) or ""),
-        category=row.category,
+        is_standard=all(
+            _threshold(shipped.get(key)) == _threshold(value)
+            for key, value in row.swept.items()
+            if key.startswith(PREFIX)
+        ),
+        cell=Cell(tuple(sorted((key, str(value)) for key, value in known.items()))),
         numbers=numbers,
-        declared=known,
+        declared=declared,
         scores=scores,
     )
-
-
-def _cell(row: Row, overrides: Mapping[str, Any], axes: Sequence[str]) -> Cell:
-    known = {key: overrides.get(key, row.summary.get(key, "")) for key in (PROMPT, SEED)}
-    known[NOISE] = overrides.get(NOISE, "")
-    known |= {key: overrides.get(key, "default") for key in axes if key not in known}
-    return Cell(tuple(sorted((key, str(value)) for key, value in known.items())))
 
 
 def _threshold(value: object) -> float | str:
@@ -183,17 +163,14 @@ def _threshold(value: object) -> float | str:
     return str(value) if as_number is None else as_number
 
 
-def _varied(jobs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the keys with several values among these overrides, one of which may be the default."""
-    keys = dict.fromkeys(key for overrides in jobs for key in overrides if key != ARM)
-    return [key for key in keys if len({repr(overrides.get(key)) for overrides in jobs}) > 1]
+def _varied(rows: Sequence[Row]) -> list[str]:
+    """Return the keys with several values among these jobs.
 
-
-# The lines of a sweep's jobs repeat, and the parser takes milliseconds for each.
-@cache
-def _pair(line: str) -> tuple[str, Any]:
-    override = OverridesParser.create().parse_override(line)
-    return override.get_key_element().lstrip("+~"), override.value()
+    Settings that come with a prompt belong to the prompt.
+    """
+    brought = {key for row in rows for key in row.brought}
+    keys = dict.fromkeys(key for row in rows for key in row.swept if key not in {ARM, *brought})
+    return [key for key in keys if len({repr(row.swept.get(key)) for row in rows}) > 1]
 
 
 def histograms(result: JobResult, score: str | None = None) -> list[dict[str, Any]]:
@@ -238,17 +215,13 @@ def measured(results: Iterable[JobResult]) -> list[JobResult]:
 
 
 @cache
-def _shipped(arm: str) -> Mapping[str, Any]:
-    """Return the settings of ``configs/densifier/<arm>.yaml`` by dotted key; empty for an arm from elsewhere.
-
-    A setting that has keys, such as a schedule, is there as a whole too: an override may replace it by a
-    number.
-    """
-    # The name of an arm may be any text, also the path of another file.
-    if arm not in option_names(ARM):
+def _shipped(densifier: str) -> Mapping[str, Any]:
+    """Return the settings of ``configs/densifier/<densifier>.yaml`` by dotted key; empty for another one."""
+    # The name may be any text, also the path of another file.
+    if densifier not in option_names(ARM):
         return {}
-    node = OmegaConf.to_container(compose([f"{ARM}={arm}", "prompt=any"])[ARM], resolve=True)
-    return dict(flatten(node, with_nodes=True))
+    cfg = compose([f"{ARM}={densifier}", "prompt=any"])
+    return dict(flatten(OmegaConf.to_container(cfg[ARM], resolve=True), ARM))
 
 
 def _written(value: float | str) -> str:

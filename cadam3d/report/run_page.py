@@ -1,17 +1,16 @@
 """report.html of a run: one file with its result, its charts and its settings."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cadam3d.core.chart import Chart
 from cadam3d.core.errors import UserError
 from cadam3d.core.number import preferred
-from cadam3d.io.declarations import write_declarations
+from cadam3d.io.declarations import read_declarations
 from cadam3d.io.html import data_url, encoded, source
 from cadam3d.io.ply import read_ply
 from cadam3d.io.reading import read_bytes
-from cadam3d.io.records import MEASUREMENTS, NUMBERS, declared
+from cadam3d.io.records import MEASUREMENTS, NUMBERS, declared, read_metrics, read_summary
 from cadam3d.io.run_folder import ASSET, CONFIG, METRICS, PREVIEW, REPORT, SUMMARY, TURNTABLE, snapshots
 from cadam3d.report.charts import lines_of, sections
 from cadam3d.report.formatting import elapsed, number
@@ -46,23 +45,15 @@ LABELS = {
 }
 
 
-def write(
-    folder: Path,
-    *,
-    summary: Mapping[str, Any],
-    metrics: Sequence[Mapping[str, Any]],
-    config_text: str,
-    charts: Sequence[Chart],
-) -> Path:
-    """Write ``charts.json`` and ``report.html`` of the run in ``folder`` and return the path of the page.
+def write(folder: Path) -> Path:
+    """Write ``report.html`` of the run in ``folder`` from its files, and return the path of the page.
 
-    The page leaves out whatever is missing from ``summary`` (the content of ``summary.json``) and ``metrics``
-    (the lines of ``metrics.jsonl``). ``preview.png`` and, up to 8 MiB, ``turntable.mp4`` are embedded if they
-    exist. Raises ``UserError`` if a file cannot be written.
+    The page leaves out whatever is missing. ``preview.png`` and, up to 8 MiB, ``turntable.mp4`` are embedded
+    if they exist. Raises ``UserError`` if a file cannot be written.
     """
-    write_declarations(folder, charts)
+    summary, metrics = read_summary(folder), read_metrics(folder)
     _, refinements = lines_of(metrics)
-    video, preview = folder / TURNTABLE, folder / PREVIEW
+    video, preview, config = folder / TURNTABLE, folder / PREVIEW, folder / CONFIG
     return write_page(
         folder / REPORT,
         "run.html.jinja",
@@ -77,10 +68,10 @@ def write(
         frames=frames(folder, int(number(summary.get("steps")) or 0)),
         view_style=style(),
         view_script=f"{script()}{source(TEMPLATES / 'growth.js')}",
-        sections=sections(metrics, charts),
+        sections=sections(metrics, read_declarations(folder)),
         facts=_facts(summary),
         refinements=table([{k: v for k, v in line.items() if k != "kind"} for line in refinements]),
-        config_text=config_text,
+        config_text=config.read_text(encoding="utf-8") if config.is_file() else "",
         files=[name for name in FILES if (folder / name).is_file()],
     )
 

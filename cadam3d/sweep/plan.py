@@ -3,8 +3,7 @@
 import re
 from argparse import Namespace
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,6 +37,8 @@ PARENT = Path("multirun")
 VALUE = re.compile(r"[A-Za-z_][\w.]*=(?!.*\$\{)", re.DOTALL)
 GRID_KEY = re.compile(r"(grid|prompts)($|\.)")
 REFUSED_KEY = re.compile(r"hydra\.run\.dir$|hydra\.sweep\.subdir$|hydra[./]sweeper($|\.)")
+# In an interpolation: a reference to another setting, or the call of a function of this package.
+REFERENCE = re.compile(r"\$\{(?:cadam3d\.\w+:|([A-Za-z_][\w.]*)\})")
 MOST_ATTEMPTS = 1000
 NOTHING_TO_SWEEP = "sweep: nothing to sweep over. Try: densifier=baseline,cadam"
 
@@ -103,40 +104,80 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Base:
-    """A composed job from which other jobs differ in plain values only."""
+    """A composed job from which other jobs differ in plain values of the same keys only."""
 
     cfg: DictConfig
     plain: dict[str, Any]  # by dotted key
-    referring: list[str]  # keys of interpolations
+    referring: dict[str, list[str]]  # by key of an interpolation: the keys on whose values it depends
+    # What interpolations have become, by key and by the values on which they depend. OmegaConf would parse
+    # each of them again for every job.
+    _resolved: dict[tuple[str, ...], dict[str, Any]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, cfg: DictConfig) -> "Base":
-        """Return ``cfg`` with its values sorted into plain ones and interpolations, without Hydra's own."""
+    def of(cls, cfg: DictConfig, varying: Collection[str]) -> "Base":
+        """Return ``cfg`` with its values sorted into plain ones and interpolations, without Hydra's own.
+
+        Jobs differ in the values of the keys ``varying``.
+        """
         raw = OmegaConf.to_container(cfg, resolve=False)
         assert isinstance(raw, dict)
         raw.pop("hydra", None)
         leaves = dict(flatten(raw))
-        referring = [key for key, value in leaves.items() if "${" in str(value)]
-        return cls(cfg, {key: leaves[key] for key in leaves.keys() - set(referring)}, referring)
+        texts = {key: str(value) for key, value in leaves.items() if "${" in str(value)}
+        plain = {key: leaves[key] for key in leaves.keys() - texts.keys()}
+        return cls(cfg, plain, {key: _causes(key, texts, varying) for key in texts})
 
     def composed(self, values: Mapping[str, Any]) -> Composed:
         """Return the job with other ``values``, set as Hydra sets them."""
         for key, value in values.items():
             OmegaConf.update(self.cfg, key, value, merge=True)
         resolved: dict[str, Any] = {}
-        unknown = set(self.referring)
-        for key in self.referring:
-            with suppress(InterpolationResolutionError):  # such as ${hydra:...}
-                node = OmegaConf.select(self.cfg, key)
-                # A reference to a whole part, such as ${prompting}, stands for all its settings.
-                plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
-                resolved.update(flatten(plain, key))
-                unknown.remove(key)
+        unknown: set[str] = set()
+        for key, causes in self.referring.items():
+            state = (key, *(repr(values.get(cause)) for cause in causes))
+            if state not in self._resolved:
+                self._resolved[state] = self._resolve(key)
+            resolved |= self._resolved[state]
+            unknown |= set() if self._resolved[state] else {key}
         return Composed(
             values={**self.plain, **values, **resolved},
             choices=self.cfg.hydra.runtime.choices,
             unknown=unknown,
         )
+
+    def _resolve(self, key: str) -> dict[str, Any]:
+        """Return the value of an interpolation by key; {} if only a running job has it.
+
+        A reference to a whole part, such as ``${prompting}``, stands for all its settings.
+        """
+        try:
+            node = OmegaConf.select(self.cfg, key)
+        except InterpolationResolutionError:  # such as ${hydra:...}
+            return {}
+        plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
+        return dict(flatten(plain, key))
+
+
+def _causes(key: str, texts: Mapping[str, str], varying: Collection[str]) -> list[str]:
+    """Return the keys of ``varying`` on which an interpolation depends, directly or by way of others."""
+    seen, new = {key}, [key]
+    causes: set[str] = set()
+    while new:
+        text = texts[new.pop()]
+        references = REFERENCE.findall(text)
+        if len(references) < text.count("${"):
+            return list(varying)
+        for one in filter(None, references):
+            causes |= {each for each in varying if _overlap(each, one)}
+            more = {each for each in texts if _overlap(each, one)} - seen
+            seen |= more
+            new += more
+    return sorted(causes)
+
+
+def _overlap(one: str, other: str) -> bool:
+    """Return whether two dotted keys are equal, or one is a part of the other."""
+    return f"{one}.".startswith(f"{other}.") or f"{other}.".startswith(f"{one}.")
 
 
 class Composer:
@@ -179,13 +220,13 @@ class Composer:
         """Return a job under ``overrides`` that differs from others in ``values``, composed only once."""
         known = tuple(key_of(line) if line in values else line for line in overrides)
         if known not in self._bases:
-            base = self._base(overrides)
+            base = self._base(overrides, [key_of(line) for line in values])
             require_effective(base.cfg, "sweep", overrides)
             self._bases[known] = base
         return self._bases[known]
 
-    def _base(self, overrides: Sequence[str]) -> Base:
-        return Base.of(compose([*self._common, *overrides], "train", self._options))
+    def _base(self, overrides: Sequence[str], varying: Collection[str] = ()) -> Base:
+        return Base.of(compose([*self._common, *overrides], "train", self._options), varying)
 
 
 def read_sweep(overrides: Sequence[str], options: Namespace) -> Sweep:
@@ -207,7 +248,9 @@ def read_sweep(overrides: Sequence[str], options: Namespace) -> Sweep:
     if node is None and prompts is None and len(jobs) == 1:
         raise UserError(NOTHING_TO_SWEEP)
     composed = compose_all(jobs, composer)
-    keys = dict.fromkeys([*ALWAYS_SHOWN, *swept_keys(grid, axes)])
+    # A report must know a threshold that is not the shipped one, even if all jobs share it.
+    thresholds = [key for key in axes if key.startswith("densifier.")]
+    keys = dict.fromkeys([*ALWAYS_SHOWN, *swept_keys(grid, axes), *thresholds])
     name = sweep_name(cfg.hydra.runtime.choices.get("grid"), axes, prompts)
     return Sweep(
         cfg=cfg,

@@ -7,11 +7,9 @@ import os
 import shlex
 import signal
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
@@ -19,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d.core.checks import fail
 from cadam3d.core.console import complain, say, show
 from cadam3d.core.errors import UserError
+from cadam3d.core.signals import StopOnSignal
 from cadam3d.io.lock import locked
 from cadam3d.io.occupied import in_use
 from cadam3d.io.records import read_config
@@ -83,7 +82,9 @@ def run_sweep(
         return Ended(folder, 0, was_dry=True)
     claim(folder, sweep.folder_key, is_chosen=True)
     lock = locked(folder / LOCK, lambda holder: in_use(folder, holder, sweep.folder_key))
-    with lock, _stoppable(folder) as stop:
+    stop = StopOnSignal((signal.SIGINT, signal.SIGTERM), (folder / STOP).touch)
+    with lock, stop:
+        (folder / STOP).unlink(missing_ok=True)
         _refuse_occupied(folder, sweep.folder_key)
         _write_plan(sweep, overrides, flags)
         on_start(folder)
@@ -97,25 +98,6 @@ def run_sweep(
     if stop.received is not None:
         return Ended(folder, 128 + stop.received, was_stopped=True)
     return Ended(folder, code)
-
-
-class Stop:
-    """Handles SIGINT and SIGTERM: after the first one, all jobs save and end, on whatever machine they run.
-
-    The second one ends everything at once.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.received: int | None = None
-        self._mark = folder / STOP
-
-    def __call__(self, number: int, _frame: FrameType | None) -> None:
-        """Handle a signal."""
-        if self.received is not None:
-            raise KeyboardInterrupt
-        self.received = number
-        self._mark.touch()
-        say("\nStopping as soon as all running jobs have saved; interrupt again to stop at once.")
 
 
 def _refuse_occupied(folder: Path, key: str) -> None:
@@ -228,16 +210,3 @@ def _report_results(sweep: Sweep, rows: Sequence[Row], problem: str) -> int:
         "Type the same line again to continue."
     )
     return 1
-
-
-@contextmanager
-def _stoppable(folder: Path) -> Iterator[Stop]:
-    """Handle signals with a ``Stop``, and restore the previous handlers at the end."""
-    (folder / STOP).unlink(missing_ok=True)
-    stop = Stop(folder)
-    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

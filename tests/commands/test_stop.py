@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from cadam3d.commands.control import TOGETHER_SECONDS, StopOnSignal
+from cadam3d.core.signals import TOGETHER_SECONDS, StopOnSignal
 
 BOTH = (signal.SIGINT, signal.SIGTERM)
 

@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from declarations import declared
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from cadam3d.core.chart import Chart, Curve, Level
 from cadam3d.io import run_folder
@@ -32,6 +34,13 @@ SHAKE = Chart(
 )
 
 
+@cache
+def pair(override: str) -> tuple[str, Any]:
+    """Return the key and the value of an override."""
+    parsed = OverridesParser.create().parse_override(override)
+    return parsed.key_or_group, parsed.value()
+
+
 class Jobs:
     """Writes the folder of a sweep: its plan, and a folder per job."""
 
@@ -46,7 +55,8 @@ class Jobs:
     def plan(self, arm: str, overrides: Sequence[str], name: str = "") -> Path:
         """Add a job to the plan and return its folder, which does not exist yet."""
         name = name or f"{len(self.planned)}_{overrides[0].partition('=')[2]}"
-        job = Job(arm=arm, name=name, overrides=list(overrides), swept={}, category=self.category)
+        swept = dict(map(pair, overrides))
+        job = Job(arm=arm, name=name, overrides=list(overrides), swept=swept, category=self.category)
         self.planned.append(job)
         self.write_plan()
         return self.folder / name
@@ -169,9 +179,8 @@ def bench(tmp_path_factory) -> Path:
                     folder = jobs.add(densifier, *keys, *where, n=count, psnr=zero + gain)
                     jobs.files(folder, count)
     jobs.line = ["grid=pareto", "prompt=a <b>cube</b>"]
-    jobs.add(
-        "baseline", "prompt=a cube", "seed=2", "noise=strong", n=40000, psnr=18.0, outcome="max_gaussians"
-    )
+    where = ("prompt=a cube", "seed=2", "noise=strong")
+    jobs.add("baseline", "densifier.tau_pos=0.0002", *where, n=40000, psnr=18.0, outcome="max_gaussians")
     jobs.add(
         "cadam", "prompt=a cube", "seed=2", "noise=strong", n=0, psnr=None, outcome="failed", message="no <b>"
     )

@@ -198,7 +198,7 @@ def test_an_arm_is_represented_by_its_shipped_setting_or_the_one_with_the_middle
     for tau, n in ((0.001, 300), (0.004, 100), (0.002, 200)):
         jobs.add("baseline", f"densifier.tau_pos={tau}", n=n, psnr=20.0)
     assert main_setting(read(jobs.folder), "baseline").values == "0.002"
-    jobs.add("baseline", n=1000, psnr=20.0)
+    jobs.add("baseline", "densifier.tau_pos=0.0002", n=1000, psnr=20.0)
     assert main_setting(read(jobs.folder), "baseline").values == "0.0002"
 
 

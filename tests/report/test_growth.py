@@ -1,6 +1,7 @@
 """The snapshots in the page of a run."""
 
 import base64
+import json
 import re
 
 import pytest
@@ -48,14 +49,16 @@ def test_snapshots_are_left_out_evenly_until_they_fit_and_the_last_one_stays(
 
 def test_a_run_without_anything_to_show_has_a_page_without_a_program(tmp_path):
     (tmp_path / "asset.ply").write_text("nonsense")
-    page = write_report(tmp_path, summary={"steps": 3}, metrics=[], config_text="")
+    (tmp_path / "summary.json").write_text('{"steps": 3}')
+    page = write_report(tmp_path)
     assert "<script" not in page.read_text(encoding="utf-8")
 
 
 def test_the_page_contains_the_snapshots_and_a_slider_over_them(tmp_path):
     record(tmp_path, 0, 50, 100)
     summary = {"prompt": '"><script>alert(1)</script>', "steps": 100}
-    text = write_report(tmp_path, summary=summary, metrics=[], config_text="").read_text(encoding="utf-8")
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    text = write_report(tmp_path).read_text(encoding="utf-8")
     assert re.findall(r'class="snapshot" data-step="(\d+)"', text) == ["0", "50", "100"]
     assert 'max="2" value="2"' in text
     assert "class SplatView" in text

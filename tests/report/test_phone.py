@@ -86,8 +86,10 @@ def test_the_page_of_a_run_fits_a_phone(tmp_path):
         for i in range(1, 3000, 100)
     ]
     summary = {"prompt": "a very long " + "word" * 30, "outcome": "finished", "note": "x" * 200}
-    page = report.write_report(tmp_path, summary=summary, metrics=metrics, config_text="y" * 500)
-    width, texts, smallest = measured(page, tmp_path)
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    (tmp_path / "metrics.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in metrics))
+    (tmp_path / "config.yaml").write_text("y" * 500)
+    width, texts, smallest = measured(report.write_report(tmp_path), tmp_path)
     assert width <= PHONE
     assert texts > 10
     assert smallest >= LEGIBLE

@@ -161,8 +161,8 @@ def test_jobs_of_a_prompt_are_compared_whether_or_not_they_have_its_settings(tmp
         Job(
             arm=arm,
             name=f"{arm}_{prompt}",
-            overrides=[f"prompt='{prompt}'", *([f"initializer.prompt='{prompt}s'"] if brought else [])],
-            swept={},
+            overrides=[],
+            swept={"prompt": prompt, "initializer.prompt": f"{prompt}s" if brought else None},
             brought=brought,
         )
         for prompt in ("cat", "dog")

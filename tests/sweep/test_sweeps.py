@@ -404,7 +404,7 @@ def test_sigint_stops_all_running_jobs_and_the_table_is_right(launcher, running,
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
-    assert "Stopping as soon as all running jobs have saved" in err
+    assert "Stopping as soon as everything is saved" in err
     assert f"6 of 6 jobs without a result ({running} interrupted, {6 - running} unfinished)" in err
     assert "Traceback" not in err
     outcomes = [row["outcome"] for row in read_table(tmp_path / "x")]

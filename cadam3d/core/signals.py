@@ -1,0 +1,49 @@
+"""Signals: a first Ctrl-C or SIGTERM asks a long work to save and stop, and a second one ends it at once."""
+
+import logging
+import signal
+import time
+from collections.abc import Callable, Sequence
+from types import FrameType
+from typing import Any
+
+from cadam3d.core.console import say
+
+# Signals that arrive within this time of each other count as one.
+TOGETHER_SECONDS = 1.0
+
+
+class StopOnSignal:
+    """Handles signals: after the first one the loop stops and saves, a later one stops it at once.
+
+    Signals within ``TOGETHER_SECONDS`` count as one, because a scheduler sends its signal to a process and
+    also to its parent, which passes it on.
+    """
+
+    def __init__(self, numbers: Sequence[int], on_first: Callable[[], None] = lambda: None) -> None:
+        self.received: int | None = None
+        self._numbers, self._on_first = numbers, on_first
+        self._received_at = 0.0
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> "StopOnSignal":
+        for number in self._numbers:
+            self._previous[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def __call__(self) -> bool:
+        """Return whether a signal has arrived."""
+        return self.received is not None
+
+    def _handle(self, number: int, _frame: FrameType | None) -> None:
+        if self.received is not None:
+            if time.monotonic() - self._received_at < TOGETHER_SECONDS:
+                return
+            raise KeyboardInterrupt
+        self.received, self._received_at = number, time.monotonic()
+        self._on_first()
+        say("\nStopping as soon as everything is saved; interrupt again to stop at once.", logging.WARNING)
