@@ -3,6 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -32,6 +33,7 @@ from cadam3d.io.run_folder import (
     shown,
     typed_path,
 )
+from cadam3d.io.text_tables import bullets
 from cadam3d.report.formatting import plural
 from cadam3d.settings.compose import Call
 from cadam3d.study.answers import collect, find_files, read_files
@@ -94,15 +96,7 @@ def _settings(cfg: DictConfig) -> ClipSettings:
     require_range("catch_share", cfg.catch_share, low=0, high=1)
     if cfg.pairs is not None:
         require_whole("pairs", cfg.pairs, low=1)
-    return ClipSettings(
-        size=cfg.size,
-        frames=cfg.frames,
-        seconds=cfg.seconds,
-        elevation_deg=cfg.elevation_deg,
-        distance=cfg.distance,
-        backdrop=list(cfg.backdrop),
-        quality=cfg.quality,
-    )
+    return ClipSettings(**{each.name: cfg[each.name] for each in fields(ClipSettings)})
 
 
 def _pairs(cfg: DictConfig) -> list[RunPair]:
@@ -157,7 +151,7 @@ def _write_page(
 def _evaluate(cfg: DictConfig) -> None:
     """Analyse the answers, print the result, and write ``study.json`` and ``study.md`` beside the key."""
     from cadam3d.study.analysis import analyse
-    from cadam3d.study.summary import bullets, markdown
+    from cadam3d.study.summary import markdown
 
     require_range("least_caught", cfg.least_caught, low=0, high=1)
     files, left = read_files(find_files(_texts(cfg.answers)))

@@ -15,6 +15,7 @@ import torch
 
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
+from cadam3d.io.asset_record import sha256_of
 from cadam3d.io.jsonl import read_json
 from cadam3d.io.pretrained import read_model, read_network, require_extra, short
 
@@ -143,7 +144,7 @@ class TransformerFolder:
 
 def model_facts(model: str, revision: str | None, weights: Sequence[Path]) -> dict[str, Any]:
     """Return what the record of a number says about a model with these files of weights."""
-    return {"model": model, "revision": revision, "weights_sha256": sha256_of(weights)}
+    return {"model": model, "revision": revision, "weights_sha256": weights_hash(weights)}
 
 
 @lru_cache(maxsize=KEPT)
@@ -155,22 +156,19 @@ def kept(load: Callable[..., Model], *which: Any) -> Model:
     return load(*which)
 
 
-def sha256_of(files: Sequence[Path]) -> str:
+def weights_hash(files: Sequence[Path]) -> str:
     """Return a hash of the content of files, as hexadecimal digits.
 
     For one file it is the SHA-256 that ``sha256sum`` prints and the hub shows. For several it is the SHA-256
     of the lines that ``sha256sum`` prints for them, in the order of their names.
     """
-    hashes = {
-        file.name: _hashed(file.resolve(), file.stat().st_size, file.stat().st_mtime_ns) for file in files
-    }
-    if len(files) == 1:
-        return hashes[files[0].name]
-    lines = "".join(f"{digest}  {name}\n" for name, digest in sorted(hashes.items()))
+    hashes = [(file.name, _hashed(file.resolve(), file.stat().st_mtime_ns)) for file in files]
+    if len(hashes) == 1:
+        return hashes[0][1]
+    lines = "".join(f"{digest}  {name}\n" for name, digest in sorted(hashes))
     return hashlib.sha256(lines.encode()).hexdigest()
 
 
 @cache  # some files have gigabytes, and several metrics of every job of a sweep need the hash
-def _hashed(file: Path, _size: int, _changed: int) -> str:
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+def _hashed(file: Path, _changed: int) -> str:
+    return sha256_of(file)

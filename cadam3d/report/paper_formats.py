@@ -1,12 +1,10 @@
 """Formats of the paper's table: Markdown, CSV and LaTeX, which show the same text in every cell."""
 
-import csv
-import io
-import re
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 
+from cadam3d.io import text_tables
 from cadam3d.io.atomic import replacing
 from cadam3d.io.run_folder import PAPER_TABLE_CSV, PAPER_TABLE_LATEX, PAPER_TABLE_MARKDOWN
 from cadam3d.report.paper_table import FIRST, PaperTable, paper_table
@@ -31,21 +29,8 @@ LATEX = {
 
 def markdown(table: PaperTable) -> str:
     """Return the table as Markdown, with its notes as a list."""
-    rule = [*["---"] * len(FIRST), *["---:"] * len(table.numbers)]
-    rows = [_markdown_line(table.titles), f"| {' | '.join(rule)} |", *map(_markdown_line, table.lines)]
-    return "\n".join([*rows, "", *(f"- {note}" for note in table.notes)]) + "\n"
-
-
-def _markdown_line(cells: Sequence[str]) -> str:
-    escaped = (re.sub(r"([\\|*_`<\[])", r"\\\1", " ".join(cell.split())) for cell in cells)
-    return f"| {' | '.join(escaped)} |"
-
-
-def comma_separated(table: PaperTable) -> str:
-    """Return the table as CSV."""
-    file = io.StringIO()
-    csv.writer(file, lineterminator="\n").writerows([table.titles, *table.lines])
-    return file.getvalue()
+    rows = text_tables.markdown([table.titles, *table.lines], table.is_text)
+    return f"{rows}\n\n{text_tables.bullets(table.notes)}\n"
 
 
 def latex(table: PaperTable) -> str:
@@ -68,7 +53,7 @@ def _latex_line(cells: Sequence[str]) -> str:
     return " & ".join(map(in_latex, cells)) + r" \\"
 
 
-FORMATS = {PAPER_TABLE_MARKDOWN: markdown, PAPER_TABLE_CSV: comma_separated, PAPER_TABLE_LATEX: latex}
+FORMATS = (PAPER_TABLE_MARKDOWN, PAPER_TABLE_CSV, PAPER_TABLE_LATEX)
 
 
 def read_table(sweep: Path) -> PaperTable | None:
@@ -87,7 +72,8 @@ def write(sweep: Path) -> str:
         for name in FORMATS:
             (sweep / name).unlink(missing_ok=True)
         return ""
-    for name, write_as in FORMATS.items():
+    text_tables.write_csv(sweep / PAPER_TABLE_CSV, [table.titles, *table.lines])
+    for name, text in ((PAPER_TABLE_MARKDOWN, markdown(table)), (PAPER_TABLE_LATEX, latex(table))):
         with replacing(sweep / name) as temporary:
-            temporary.write_text(write_as(table), encoding="utf-8")
+            temporary.write_text(text, encoding="utf-8")
     return markdown(table)

@@ -90,8 +90,8 @@ def write(sweep_folder: Path, baseline: str | None = None) -> Path:
     folder = sweep_folder / FIGURES
     comparison = tables.comparison_table(results, baseline)
     medians = tables.medians_table(results)
-    tables.write_csv(folder / "comparison.csv", comparison)
-    tables.write_csv(folder / "medians.csv", medians)
+    tables.write(folder / "comparison.csv", comparison)
+    tables.write(folder / "medians.csv", medians)
     kinds = KINDS | _scores(results)
     chosen = list(kinds) if plan.figures is None else plan.figures
     kinds |= _frontiers(results)

@@ -1,6 +1,5 @@
 """Tables of a sweep as lists of plain lines, written as CSV and shown on its page and in the terminal."""
 
-import csv
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from cadam3d.core.number import COUNT, Number
-from cadam3d.io.atomic import replacing
+from cadam3d.io.text_tables import write_csv
 from cadam3d.report.compare import (
     Estimate,
     above_frontier,
@@ -109,8 +108,8 @@ def medians_table(results: Sequence[JobResult]) -> list[Line]:
     return _without_empty(lines)
 
 
-def write_csv(path: Path, lines: Sequence[Line]) -> None:
-    """Write a table atomically, an estimate as three columns."""
+def write(path: Path, lines: Sequence[Line]) -> None:
+    """Write a table as CSV, atomically, an estimate as three columns."""
     plain = []
     for line in lines:
         plain.append({})
@@ -119,10 +118,8 @@ def write_csv(path: Path, lines: Sequence[Line]) -> None:
                 plain[-1] |= {key: value.median, f"{key}: low": value.low, f"{key}: high": value.high}
             else:
                 plain[-1][key] = value
-    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys(key for line in plain for key in line)))
-        writer.writeheader()
-        writer.writerows(plain)
+    keys = list(dict.fromkeys(key for line in plain for key in line))
+    write_csv(path, [keys, *([line.get(key) for key in keys] for line in plain)])
 
 
 def _compared(results: Iterable[JobResult]) -> list[Number]:
@@ -134,11 +131,8 @@ def _compared(results: Iterable[JobResult]) -> list[Number]:
 
 def _median(values: Iterable[float | None], digits: int) -> float | int | None:
     known = [value for value in values if value is not None]
-    return _rounded(float(np.median(known)), digits) if known else None
-
-
-def _rounded(value: float | None, digits: int) -> float | int | None:
-    return None if value is None else round(value, digits) if digits else round(value)
+    # Without digits, the result is a whole number.
+    return round(float(np.median(known)), digits or None) if known else None
 
 
 def _without_empty(lines: list[Line]) -> list[Line]:

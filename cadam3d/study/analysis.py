@@ -18,7 +18,6 @@ from cadam3d.study.estimates import (
     CONFIDENCE,
     Clusters,
     Interval,
-    SignTest,
     holm,
     rate_interval,
     sign_test,
@@ -66,9 +65,9 @@ class ComparedPair:
     rate: Rate  # of the first arm, against the second
     # A test over prompts says whether other prompts would give the same result with these raters, and a test
     # over raters whether other raters would with these prompts. A claim about both needs both tests.
-    over_prompts: SignTest
-    over_raters: SignTest
-    p_value: float  # the larger one of the two tests
+    p_over_prompts: float
+    p_over_raters: float
+    p_value: float  # the larger one of the two
     corrected_p_value: float  # by Holm's method, for the number of comparisons in the study
 
     @property
@@ -194,13 +193,13 @@ def _rate(arm: str, answers: Sequence[Answer]) -> Rate:
 def _comparison(first: str, second: str, answers: Sequence[Answer]) -> ComparedPair:
     chosen, clusters = _is_chosen(first, answers), _clusters(answers)
     over_prompts, over_raters = sign_test(chosen, clusters.prompts), sign_test(chosen, clusters.raters)
-    p_value = max(over_prompts.p_value, over_raters.p_value)
+    p_value = max(over_prompts, over_raters)
     return ComparedPair(
         first,
         second,
         rate=_rate(first, answers),
-        over_prompts=over_prompts,
-        over_raters=over_raters,
+        p_over_prompts=over_prompts,
+        p_over_raters=over_raters,
         p_value=p_value,
         corrected_p_value=p_value,
     )

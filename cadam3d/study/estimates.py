@@ -117,22 +117,14 @@ def _unanimous(clusters: Clusters) -> float:
     return max(exact, turned)
 
 
-@dataclass(frozen=True)
-class SignTest:
-    """An exact sign test over raters or over prompts."""
+def sign_test(chosen: Bool[np.ndarray, "n"], units: Int[np.ndarray, "n"]) -> float:
+    """Return the two-sided p-value of "neither arm has more majorities", in which each unit has one vote.
 
-    wins: int  # units in which the first arm was chosen more often
-    losses: int
-    ties: int  # units with equally many answers for both, which the test leaves out
-    p_value: float  # two-sided; 1 if all units are ties
-
-
-def sign_test(chosen: Bool[np.ndarray, "n"], units: Int[np.ndarray, "n"]) -> SignTest:
-    """Return the sign test of "neither arm has more majorities", in which each unit has one vote."""
+    Units with equally many answers for both arms are left out. The result is 1 if all units are such.
+    """
     margins = np.bincount(units, weights=np.where(chosen, 1, -1))
     wins, losses = int((margins > 0).sum()), int((margins < 0).sum())
-    p_value = float(binomtest(wins, wins + losses).pvalue) if wins + losses else 1.0
-    return SignTest(wins, losses, len(margins) - wins - losses, p_value)
+    return float(binomtest(wins, wins + losses).pvalue) if wins + losses else 1.0
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

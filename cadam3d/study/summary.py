@@ -1,8 +1,7 @@
 """Summary: the analysis of a study as Markdown, which the command also prints."""
 
-import re
-from collections.abc import Sequence
-
+from cadam3d.io.text_tables import bullets
+from cadam3d.io.text_tables import markdown as table
 from cadam3d.study.analysis import Analysis, Rate
 from cadam3d.study.estimates import Interval
 from cadam3d.study.questions import QUESTIONS, Question
@@ -13,7 +12,6 @@ PUBLISHED = {
     "Baseline": (50.5, 45.8, 51.9, 55.7, 50.4),
     "CAdam": (49.4, 54.1, 48.0, 44.3, 49.5),
 }
-SPECIAL = re.compile(r"([\\|<*`\[])")  # in Markdown; names of arms and raters may contain them
 NONE = "-"
 READING = (
     "A star marks a certain difference: the interval excludes 50 %, and the sign tests over raters and over "
@@ -38,11 +36,6 @@ def markdown(analysis: Analysis) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def bullets(lines: Sequence[str]) -> str:
-    """Return a list of sentences, in which names of raters and files stay text."""
-    return "\n".join(f"- {_escaped(line)}" for line in lines)
-
-
 def screening_lines(analysis: Analysis) -> list[str]:
     """Return which raters were excluded and which met no catch trial."""
     kept, excluded = analysis.screening.kept, analysis.screening.excluded
@@ -65,7 +58,8 @@ def _rates(analysis: Analysis) -> str:
 
     rows = [[arm, *(cell(question, arm) for question in QUESTIONS)] for arm in analysis.arms]
     rows += [[f"{arm} (published)", *(f"{rate:.1f}" for rate in rates)] for arm, rates in PUBLISHED.items()]
-    return _table(["arm", *(question.short for question in QUESTIONS)], rows)
+    titles = ["arm", *(question.short for question in QUESTIONS)]
+    return table([titles, *rows], [True] * len(titles))
 
 
 def _pairs(analysis: Analysis) -> str:
@@ -80,16 +74,7 @@ def _pairs(analysis: Analysis) -> str:
         for result in analysis.questions
         for pair in result.comparisons
     ]
-    return _table(["question", "pair", "%", "95 % interval", "p"], rows)
-
-
-def _table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table whose columns are aligned, so that it can be read in a terminal too."""
-    lines = [titles, *([_escaped(cell) for cell in row] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    lines.insert(1, ["-" * width for width in widths])
-    padded = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines]
-    return "\n".join(f"| {' | '.join(line)} |" for line in padded)
+    return table([["question", "pair", "%", "95 % interval", "p"], *rows], [True] * 5)
 
 
 def _percent(share: float) -> str:
@@ -98,7 +83,3 @@ def _percent(share: float) -> str:
 
 def _range(interval: Interval) -> str:
     return f"({100 * interval.low:.1f} to {100 * interval.high:.1f})"
-
-
-def _escaped(words: str) -> str:
-    return SPECIAL.sub(r"\\\1", words)

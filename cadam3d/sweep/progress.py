@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from statistics import mean
 from typing import Any
 
 from cadam3d.core.console import show
@@ -71,16 +70,6 @@ def describe_result(summary: Mapping[str, Any]) -> str:
     if "seconds" in summary:
         facts.append(f"{summary['seconds']:.0f} s")
     return ", ".join(facts)
-
-
-def time_left(rows: Sequence[Row]) -> str:
-    """Return how long the jobs without a result will take, from the mean time of training of the others."""
-    left = sum(not row.has_result for row in rows)
-    times = [row.summary["seconds"] for row in rows if row.has_result and "seconds" in row.summary]
-    if not left or not times:
-        return "No job is left." if not left else "How long they take is known once a job has a result."
-    each = mean(times)
-    return f"About {duration(each * left)} of computing are left, at {duration(each)} per job."
 
 
 def duration(seconds: float) -> str:

@@ -15,7 +15,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.core.checks import fail
-from cadam3d.core.console import complain, say, show
+from cadam3d.core.console import complain, show
 from cadam3d.core.errors import UserError
 from cadam3d.core.signals import StopOnSignal
 from cadam3d.io.lock import locked
@@ -42,7 +42,7 @@ from cadam3d.settings.trust import is_trusted, require_contained
 from cadam3d.sweep import worker
 from cadam3d.sweep.folder import Plan, Row, is_sweep, load, rows_of, write_plan
 from cadam3d.sweep.plan import Composed, Sweep, search_path
-from cadam3d.sweep.progress import reporting, time_left
+from cadam3d.sweep.progress import reporting
 from cadam3d.sweep.table import as_text, listing, write_table
 
 LONGEST = 40  # rows of a table in the terminal
@@ -78,7 +78,7 @@ def run_sweep(
     rows = rows_of(folder, sweep.jobs)
     _refuse_other_settings(rows, sweep.composed, folder, sweep.folder_key)
     if sweep.is_dry:
-        show(f"{_title(sweep, rows)}\n\n{listing(rows)}\n\n{time_left(rows)}")
+        show(f"{_title(sweep, rows)}\n\n{listing(rows)}")
         return Ended(folder, 0, was_dry=True)
     claim(folder, sweep.folder_key, is_chosen=True)
     lock = locked(folder / LOCK, lambda holder: in_use(folder, holder, sweep.folder_key))

@@ -1,14 +1,13 @@
 """Table: write ``sweep.csv``, with one row per job, from the files on disk."""
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cadam3d.io.atomic import replacing
 from cadam3d.io.jsonl import to_json
 from cadam3d.io.records import declared, difference, psnr_of, read_scores
 from cadam3d.io.run_folder import TABLE
+from cadam3d.io.text_tables import write_csv
 from cadam3d.sweep.folder import Row, load
 
 FACTS = ("num_gaussians", "num_gaussians_initial", "psnr", "ssim", "seconds", "asset_bytes", "message")
@@ -27,7 +26,8 @@ def write_table(sweep: Path) -> list[Row]:
     """
     rows = load(sweep)
     while True:
-        _write(sweep / TABLE, rows)
+        columns = columns_of(rows)
+        write_csv(sweep / TABLE, [columns, *zip(*columns.values(), strict=True)])
         written, rows = rows, load(sweep)
         if rows == written:
             return rows
@@ -113,14 +113,6 @@ def columns_of(rows: Sequence[Row]) -> dict[str, Sequence[Any]]:
         **_scores(rows)[0],
         "folder": [row.name for row in rows],
     }
-
-
-def _write(path: Path, rows: Sequence[Row]) -> None:
-    columns = columns_of(rows)
-    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows(zip(*columns.values(), strict=True))
 
 
 def _comparisons(rows: Sequence[Row]) -> list[str]:

@@ -19,7 +19,7 @@ from cadam3d.metric.base import Measurand
 from cadam3d.metric.clip_r_precision import ClipRPrecision
 from cadam3d.metric.clip_score import ClipScore
 from cadam3d.metric.pick_score import PickScore
-from cadam3d.metric.transformer import TransformerFolder, sha256_of
+from cadam3d.metric.transformer import TransformerFolder, weights_hash
 
 PROMPT = "a red cube"
 PROTOCOL = ring(
@@ -162,7 +162,7 @@ def test_the_hash_of_several_files_is_that_of_the_list_of_sha256sum(tmp_path):
         (tmp_path / name).write_text(name)
         lines += f"{hashlib.sha256(name.encode()).hexdigest()}  {name}\n"
     files = sorted(tmp_path.iterdir(), reverse=True)
-    assert sha256_of(files) == hashlib.sha256(lines.encode()).hexdigest()
+    assert weights_hash(files) == hashlib.sha256(lines.encode()).hexdigest()
 
 
 def test_a_long_prompt_is_cut_off_with_a_warning(make, measurand):
