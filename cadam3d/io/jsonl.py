@@ -12,7 +12,7 @@ from annotated_types import Ge, Le
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
-from cadam3d.io.reading import LARGEST_TEXT, read_bytes
+from cadam3d.io.reading import DEEPEST, LARGEST_TEXT, read_bytes
 
 # Limits of numbers in the files of a run. Nothing real comes near them.
 MOST = 10**12  # steps, Gaussians, bytes
@@ -52,7 +52,7 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
     for line in read_bytes(path, largest=LARGEST_TEXT).split(b"\n"):
         try:
             value = parse_json(line)
-        except (ValueError, RecursionError):
+        except ValueError:
             continue
         if isinstance(value, dict):
             objects.append(value)
@@ -87,7 +87,7 @@ def read_json(path: Path) -> Any:
     content = read_bytes(path, largest=LARGEST_TEXT)
     try:
         return parse_json(content)
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(
             f"{path}: not valid JSON ({reason}). Try: cadam3d train resume=RUN, which writes it again"
@@ -126,11 +126,27 @@ def to_json(value: Any, indent: int | None = None) -> str:
 
 
 def parse_json(content: bytes) -> Any:
-    """Return the value of a JSON text. Raises ``ValueError`` or ``RecursionError`` for any other text."""
-    value = json.loads(content.decode("utf-8"))
-    # This raises the same errors for NaN, infinities and half of a character pair, which JSON can spell.
+    """Return the value of a JSON text. Raises ``ValueError`` for any other text, and for too many levels."""
+    try:
+        value = json.loads(content.decode("utf-8"))
+    except RecursionError as error:
+        raise ValueError(f"more than {DEEPEST} levels") from error
+    if content.count(b"[") + content.count(b"{") > DEEPEST:
+        _require_shallow(value)
+    # This raises the same error for NaN, infinities and half of a character pair, which JSON can spell.
     json.dumps(value, ensure_ascii=False, allow_nan=False).encode("utf-8")
     return value
+
+
+def _require_shallow(value: Any) -> None:
+    """Raise ``ValueError`` if containers are deeper than any program writes, because many readers recurse."""
+    level = [value]
+    for _ in range(DEEPEST + 1):
+        nodes = [node for node in level if isinstance(node, (dict, list))]
+        level = [each for node in nodes for each in (node.values() if isinstance(node, dict) else node)]
+        if not level:
+            return
+    raise ValueError(f"more than {DEEPEST} levels")
 
 
 def _standard(value: Any) -> Any:

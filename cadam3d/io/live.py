@@ -165,7 +165,7 @@ def read_state(run: Path) -> dict[str, Any] | None:
         return None
     try:
         state = parse_json(read_bytes(path, largest=LARGEST_STATE))
-    except (UserError, ValueError, RecursionError):
+    except (UserError, ValueError):
         return None
     is_sound = isinstance(state, dict) and all(
         name in state and fits(state[name], kind) for name, kind in KINDS.items()

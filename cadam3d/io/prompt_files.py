@@ -109,7 +109,7 @@ def _entries(path: Path, place: str) -> Iterator[tuple[str, Any, str]]:
             return
         root = parse_json(text.encode()) if suffix in JSON else parse_text_yaml(text)
     # A number with thousands of digits raises ValueError.
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError) as error:
         reason = " ".join(str(error).split())[:120]
         raise fail(place, expected="UTF-8 text, plain YAML or JSON", got=reason, example=EXAMPLE) from error
     lists = root if isinstance(root, dict) else {"": root}

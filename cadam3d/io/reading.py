@@ -20,7 +20,7 @@ from cadam3d.core.errors import UserError
 # Bytes. A configuration has some ten thousand; the table of a run of many hours has some ten million.
 LARGEST_TEXT = 1 << 28
 LARGEST_YAML = 1 << 22
-DEEPEST = 64  # levels of YAML
+DEEPEST = 64  # levels of YAML and JSON
 BLANKS = "\n\t\r"  # the control characters that a text may have
 KINDS = {
     stat.S_IFDIR: "a folder",

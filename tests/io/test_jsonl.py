@@ -34,6 +34,29 @@ def test_values_that_json_lacks_become_null(tmp_path, value):
     json.loads((tmp_path / "s.json").read_text(), parse_constant=refuse_constant)
 
 
+@pytest.mark.parametrize("levels", [65, 900, 5_000, 300_000])
+@pytest.mark.parametrize(("begin", "end"), [("[", "]"), ('{"a":', "}"), ('[{"a":', "}]")])
+@pytest.mark.parametrize("is_closed", [True, False])
+def test_json_that_is_too_deep_is_one_message_and_never_an_error_of_recursion(
+    levels, begin, end, is_closed, tmp_path
+):
+    """Some Pythons parse five thousand levels, but most code that uses the result recurses and fails."""
+    text = begin * levels + "1" + end * levels * is_closed
+    (tmp_path / "a.json").write_text(text)
+    (tmp_path / "a.jsonl").write_text(f"{text}\n{{}}\n")
+    with pytest.raises(UserError, match=r"^[^\n]*not valid JSON[^\n]*$"):
+        read_json(tmp_path / "a.json")
+    assert read_jsonl(tmp_path / "a.jsonl") == [{}]
+
+
+def test_json_of_every_depth_that_is_written_is_read(tmp_path):
+    deep: list = []
+    for _ in range(63):
+        deep = [deep, {}]
+    write_json(tmp_path / "a.json", deep)
+    assert read_json(tmp_path / "a.json") == deep
+
+
 @pytest.mark.parametrize("cut", range(1, 20))
 def test_a_cut_last_line_is_left_out_and_harms_no_later_line(tmp_path, cut):
     path = tmp_path / "m.jsonl"
