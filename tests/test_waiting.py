@@ -5,22 +5,30 @@ one on the host raises an exception: ``item()``, ``bool()``, ``tolist()``, ``cpu
 as indices.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 from composed import composed
+from latents import KEYS
 from test_trainer import SMALL, Recorder, go, make, same
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from cadam3d.build import build_trainer, component
+from cadam3d.core.cameras import turntable
 from cadam3d.core.device import read_numbers, upload_together
 from cadam3d.core.rendering import RenderOutput
 from cadam3d.densifier.baseline import Baseline
 from cadam3d.exposure import NoExposure
 from cadam3d.prior.mvdream import CHECKED
+from cadam3d.prior.prompting import Compass, Discrete, Interpolated, PerpNeg
+from cadam3d.prior.sdxl import StableDiffusionXL
+from cadam3d.prior.texts import Texts
 from cadam3d.rasterizer.base import Rasterizer, absgrad_probe
 
 CPU, META = torch.device("cpu"), torch.device("meta")
@@ -45,6 +53,10 @@ class Blobs(Rasterizer):
         )
 
 
+# Functions that copy numbers of the host to the device of their result, below the level of dispatch.
+COPIES = (torch.tensor, torch.as_tensor, torch.asarray, Tensor.new_tensor)
+
+
 class Transfers(TorchDispatchMode):
     """Records the copies from the CPU to another device: whether each is asynchronous."""
 
@@ -57,7 +69,36 @@ class Transfers(TorchDispatchMode):
         if func is torch.ops.aten._to_copy.default and args[0].device != kwargs.get("device", args[0].device):
             assert args[0].device.type == "cpu", "a copy from the device is a wait"
             self.are_asynchronous.append(kwargs.get("non_blocking", False))
+        elif func is torch.ops.aten.copy_.default and args[0].device != args[1].device:
+            self.are_asynchronous.append(kwargs.get("non_blocking", False))
+        elif func in (torch.ops.aten.index.Tensor, torch.ops.aten.index_put_.default):
+            places = {index.device for index in args[1] if index is not None}
+            self.are_asynchronous += [False] * (places - {args[0].device} != set())
         return func(*args, **kwargs)
+
+
+class Copies(TorchFunctionMode):
+    """Adds the copies of Python's numbers to those of ``transfers``. Each of them waits."""
+
+    def __init__(self, transfers: Transfers) -> None:
+        super().__init__()
+        self.transfers = transfers
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        if func in COPIES and result.device != CPU and not isinstance(args[-1], Tensor):
+            self.transfers.are_asynchronous.append(False)
+        if func in (Tensor.__getitem__, Tensor.__setitem__) and args[0].device != CPU:
+            places = args[1] if isinstance(args[1], tuple) else args[1:2]
+            self.transfers.are_asynchronous += [False] * any(isinstance(place, list) for place in places)
+        return result
+
+
+@contextmanager
+def watched() -> Iterator[list[bool]]:
+    """Yield the list of copies to the device, each with whether it is asynchronous."""
+    with Transfers() as transfers, Copies(transfers):
+        yield transfers.are_asynchronous
 
 
 def step_without_values(monkeypatch, lines: Sequence[str]) -> tuple[int, list[bool]]:
@@ -85,26 +126,32 @@ def step_without_values(monkeypatch, lines: Sequence[str]) -> tuple[int, list[bo
         return [0.0, *[1.0] * (len(numbers) - 1)]
 
     monkeypatch.setattr("cadam3d.core.rendering.read_numbers", read)
-    with Transfers() as transfers:
+    with watched() as copies:
         trainer.step(state, embedding)
     assert (state.step, state.skipped, state.dimmed) == (1, 0, 0)
-    return len(readings), transfers.are_asynchronous
+    return len(readings), copies
 
 
 @pytest.mark.parametrize(
     "lines",
     [
-        *([f"guidance={name}"] for name in ("sds", "csd", "sdi", "ucm", "gcs")),
-        ["guidance=ism_luciddreamer"],
-        ["guidance=sdi_threestudio"],
-        *([f"densifier={name}"] for name in ("baseline", "absgrad", "random", "mcmc")),
-        ["regularizer=[mean_scale,mean_opacity,outside_ball,alpha_entropy,sparsity,squared_variation]"],
-        ["regularizer=[disparity_variation,total_variation]"],
-        ["densifier=cadam_open", "densifier.invisible=skip", "regularizer=[sparsity]"],
-        ["augmentation=lucid", "background=lucid", "camera=progressive"],
-        ["camera=multiview", "views=4", "background=black_or_white"],
-        ["exposure=beg", "exposure.begin=0"],
-        ["optimizer.clip_norm=0.1", "initializer.sh_degree=3"],
+        [
+            "guidance=sds",
+            "densifier=baseline",
+            "regularizer=[mean_scale,mean_opacity,outside_ball,alpha_entropy,sparsity,squared_variation]",
+        ],
+        ["guidance=csd", "densifier=absgrad", "regularizer=[disparity_variation,total_variation]"],
+        [
+            *("guidance=sdi", "guidance.inversion_stride=0.5", "densifier=random"),
+            *("augmentation=lucid", "background=lucid", "camera=progressive"),
+        ],
+        ["guidance=ucm", "densifier=mcmc", "exposure=beg", "exposure.begin=0"],
+        ["guidance=gcs", "densifier=cadam_open", "densifier.invisible=skip", "regularizer=[sparsity]"],
+        ["guidance=ism_luciddreamer", "camera=multiview", "views=4", "background=black_or_white"],
+        [
+            *("guidance=sdi_threestudio", "guidance.inversion_stride=0.5"),
+            *("optimizer.clip_norm=0.1", "initializer.sh_degree=3"),
+        ],
     ],
     ids=" ".join,
 )
@@ -122,6 +169,71 @@ def test_the_stand_in_refuses_to_be_waited_for(work):
     # Torch raises the first for operations that have no version without values, and the second for the rest.
     with pytest.raises((NotImplementedError, RuntimeError)):
         work(torch.ones(1, device=META))
+
+
+@pytest.mark.parametrize(
+    "copy",
+    [
+        lambda there: torch.tensor([1, 2], device=META),
+        lambda there: torch.as_tensor([1, 2], device=META),
+        lambda there: torch.as_tensor(torch.ones(2), device=META),
+        lambda there: there.new_tensor([1, 2]),
+        lambda there: torch.ones(2).to(there),
+        lambda there: there.copy_(torch.ones(2)),
+        lambda there: there[[0, 1]],
+        lambda there: there[torch.tensor([0, 1])],
+    ],
+)
+def test_copies_that_wait_are_seen(copy):
+    there = torch.ones(2, device=META)
+    with watched() as copies:
+        copy(there)
+    assert copies == [False]
+
+
+def test_what_the_device_makes_itself_is_no_copy():
+    there = torch.ones(2, device=META)
+    with watched() as copies:
+        torch.full((2,), 0.5, device=META).add_(3)
+        there[:1] = 7
+        torch.where(there > 0, 1, 2)
+        torch.arange(2, device=META)
+        torch.tensor([1.0, 2.0])
+    assert copies == []
+
+
+@pytest.mark.parametrize(
+    "prompting",
+    [
+        Discrete(front_deg=45.0, back_deg=45.0, overhead_deg=60.0),
+        Compass(below_deg=-10.0, above_deg=35.0),
+        Interpolated(),
+        PerpNeg(curve="lucid", overhead_deg=None),
+        PerpNeg(curve="threestudio", overhead_deg=60.0),
+    ],
+    ids=repr,
+)
+def test_the_texts_of_a_view_are_chosen_without_a_wait(prompting):
+    cameras = turntable(4, elevation_deg=15.0, distance=3.0, fov_y_deg=40.0, size=8).to(META)
+    with watched() as copies:
+        prompting.mix(cameras)
+    assert copies == []
+
+
+def test_the_network_of_sdxl_is_called_without_a_wait():
+    prior, seen = StableDiffusionXL(path=None, cache_dir=None, **KEYS), {}
+
+    def network(noisy, *_, added_cond_kwargs, **__):
+        seen.update(added_cond_kwargs)
+        return SimpleNamespace(sample=noisy)
+
+    vars(prior)["network"] = network
+    noisy, texts = torch.zeros(2, 4, 8, 8, device=META), Texts(torch.zeros(2, 77, 8, device=META), None)
+    cameras = turntable(2, elevation_deg=15.0, distance=3.0, fov_y_deg=40.0, size=64)
+    with watched() as copies:
+        prior.denoise(noisy, noisy[:, 0, 0, 0], texts, cameras)
+    assert copies == []
+    assert seen["time_ids"].shape == (2, 6)
 
 
 def test_a_step_with_networks_waits_for_the_device_once(monkeypatch, tmp_path):
@@ -163,12 +275,15 @@ class Ahead(Blobs):
 @pytest.mark.parametrize(
     "lines",
     [
-        ["regularizer=[mean_scale,sparsity]"],
-        ["densifier=absgrad", "densifier.tau_pos=1e-9"],
-        ["densifier=mcmc", "regularizer=[mean_opacity]"],
-        ["augmentation=lucid", "camera=progressive", "camera.size=16", "background=lucid"],
-        ["exposure=beg", "exposure.begin=0", "exposure.threshold=0.01"],
-        ["guidance=ism", "guidance.shared_t=false"],
+        [
+            *("densifier=absgrad", "densifier.tau_pos=1e-9", "regularizer=[mean_scale,sparsity]"),
+            *("augmentation=lucid", "camera=progressive", "camera.size=16", "background=lucid"),
+        ],
+        [
+            *("densifier=mcmc", "regularizer=[mean_opacity]"),
+            *("exposure=beg", "exposure.begin=0", "exposure.threshold=0.01"),
+        ],
+        ["guidance=ism", "guidance.shared_t=false", "guidance.inversion_stride=0.5"],
     ],
     ids=" ".join,
 )

@@ -187,8 +187,8 @@ class PerpNeg(Prompting):
         is_first = turned < QUARTER
         rho = torch.where(is_first, 1 - turned / QUARTER, 2 - turned / QUARTER)
         positive = _around(azimuth, k)
-        rules = torch.tensor([[SIDE, FRONT], [FRONT, SIDE]], device=azimuth.device)
-        names = rules[is_first.long()]
+        # A table of these numbers would have to be copied to the device, which waits for it.
+        names = torch.stack([torch.where(is_first, FRONT, SIDE), torch.where(is_first, SIDE, FRONT)], dim=-1)
         curves = _lucid_strengths if self.curve == "lucid" else _threestudio_strengths
         strengths = torch.where(is_first[:, None], curves(rho, True), curves(rho, False))
         if self.overhead_deg is not None:

@@ -41,9 +41,12 @@ class StableDiffusionXL(StableDiffusion):
     def denoise(self, noisy: Latents, timestep: PerView, texts: Texts, cameras: Cameras) -> Latents:
         """Run the UNet with text cross-attention; pooled text and image sizes are added to the time input."""
         height, width = (FACTOR * side for side in noisy.shape[2:])
-        # The original size, the top left corner of the crop and the target size.
-        sizes = noisy.new_tensor([[height, width, 0, 0, height, width]])
-        added = {"text_embeds": texts.pooled, "time_ids": sizes.expand(len(noisy), -1)}
+        # Heights and widths: of the original, of the top left corner of the crop, and of the target. They are
+        # filled in on the device, because copying them to it would wait for it.
+        sizes = noisy.new_zeros(len(noisy), 3, 2)
+        sizes[:, ::2, 0] = height
+        sizes[:, ::2, 1] = width
+        added = {"text_embeds": texts.pooled, "time_ids": sizes.flatten(1)}
         return self.network(
             noisy, timestep, encoder_hidden_states=texts.tokens, added_cond_kwargs=added
         ).sample

@@ -22,8 +22,8 @@ caller finds ``overflowed`` in the output.
 Nearly all arrays are in a few blocks of memory (``workspace.py``). Those that the backward pass needs are
 saved by autograd like any other tensor, so they are freed after it.
 
-All views are processed together unless their records would fill more than ``RECORD_MEMORY``. In that case
-everything except the projection runs on one group of views after another, with the same bits.
+All views are processed together unless their records would fill more memory than ``record_memory`` allows. In
+that case everything except the projection runs on one group of views after another, with the same bits.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -56,8 +56,11 @@ SPLAT, RECORD, ABSOLUTES, CAMERA = 12, 10, 2, 25  # floats
 DEPTH_BITS = 32
 # The kernels count the pairs, slots and tiles of a group and the pixels of a view with 32 bits.
 MOST = 2**31 - 1
-# Bytes of the records of one group of views. A group has at least one view, whatever that view needs.
+# Bytes that the records of one group of views may always fill, and the share of the free memory that they may
+# fill beyond. The tile lists and the sort need half as much as the records, at the same time. A group has at
+# least one view, whatever that view needs.
 RECORD_MEMORY = 256 * 2**20
+RECORD_SHARE = 0.5
 # With at most this number of tiles of 8x8 in a view, tiles are 8x4, which are more and have shorter lists.
 # Otherwise most of a large GPU would have nothing to do (docs/notes/kernels.md has the arithmetic). The
 # choice depends on the size of a view alone, so a batch has the bits of its single views on every device.
@@ -162,9 +165,12 @@ def rasterize_ahead(
     capacity = forecast.capacity(n)
     tiles = count_tiles(cameras.height, cameras.width)
     # If the views may need several groups, their numbers of slots must be known. The slots of a single view
-    # are counted too if they are as many: a forecast would reserve much more memory than most renders need,
-    # for long after a single large one, and the device is busy for longer than the wait takes.
-    if capacity is None or capacity > most_slots(absgrad) or v * max(n, tiles) > MOST:
+    # are counted too if there may not be enough memory for a forecast, which is larger than the number.
+    if (
+        capacity is None
+        or capacity > most_slots(capacity, absgrad, gaussians.device)
+        or v * max(n, tiles) > MOST
+    ):
         capacity = None
     return rasterize(launcher, gaussians, cameras, background, absgrad, capacity, forecast)
 
@@ -298,7 +304,8 @@ class _CudaPass(RenderPass):
                 f"rasterizer=cuda: expected at most {MOST} (splat, tile) pairs in a view, got {largest}. "
                 "Try: camera.size=512"
             )
-        return _split_views(slots, most_slots(self.absgrad), MOST // max(n, self.tiles))
+        most = most_slots(sum(slots), self.absgrad, self.device)
+        return _split_views(slots, most, MOST // max(n, self.tiles))
 
     def _order(self, views: slice, n: int) -> None:
         """Sort the pairs of some views by depth, and number their slots in that order."""
@@ -509,9 +516,22 @@ def count_tiles(height: int, width: int) -> int:
     return pieces(height, tile_height(height, width)) * pieces(width, TILE_WIDTH)
 
 
-def most_slots(absgrad: bool) -> int:
-    """Return the largest number of slots in a group of more than one view."""
-    return min(RECORD_MEMORY // (4 * (RECORD + ABSOLUTES * absgrad)), MOST)
+def most_slots(wanted: int, absgrad: bool, device: torch.device) -> int:
+    """Return the largest number of slots in a group of more than one view, if there are ``wanted`` in all."""
+    size = 4 * (RECORD + ABSOLUTES * absgrad)
+    return min(record_memory(size * wanted, device) // size, MOST)
+
+
+def record_memory(wanted: int, device: torch.device) -> int:
+    """Return the bytes that the records of one group of views may fill, if all records need ``wanted`` bytes.
+
+    The free memory includes what torch has reserved and does not use. To ask for it does not wait for the
+    device, but takes as long as some launches, so small scenes do not ask.
+    """
+    if device.type != "cuda" or wanted <= RECORD_MEMORY:
+        return RECORD_MEMORY
+    unused = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return max(RECORD_MEMORY, int(RECORD_SHARE * (torch.cuda.mem_get_info(device)[0] + unused)))
 
 
 def _split_views(slots: list[int], most_slots: int, most_views: int) -> list[tuple[slice, int]]:

@@ -152,6 +152,22 @@ def test_many_slots_of_a_single_view_are_counted_first(emulator, monkeypatch):
     assert render(*scene[:3]).overflowed is None
 
 
+def test_large_scenes_go_ahead_if_half_of_the_free_memory_holds_their_records(monkeypatch):
+    """Pretend to have a GPU. Three million Gaussians at 1024 pixels and four views have such numbers."""
+    device, slots, used = torch.device("cuda"), 40_000_000, []
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (used.append(device) or 3 * 2**30, 0))
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 3 * 2**29)
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 2**29)
+    assert cuda.most_slots(slots, False, device) == 2**31 // (4 * cuda.RECORD) > slots
+    assert cuda.most_slots(slots, True, device) == 2**31 // (4 * (cuda.RECORD + cuda.ABSOLUTES))
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (0, 0))
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 2**29)
+    assert cuda.most_slots(slots, False, device) == cuda.RECORD_MEMORY // (4 * cuda.RECORD) < slots
+    assert len(used) == 2
+    monkeypatch.setattr(torch.cuda, "mem_get_info", None)
+    assert cuda.most_slots(1000, False, device) >= 1000, "small scenes do not ask"
+
+
 def test_a_forecast_leaves_a_margin_and_grows_with_the_gaussians():
     new = Forecast(CPU)
     assert new.capacity(1000) is None
