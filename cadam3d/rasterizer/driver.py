@@ -76,6 +76,9 @@ class Module:
 
     def __init__(self, driver: ctypes.CDLL, index: int, cubin: bytes) -> None:
         self.driver, self.find = driver, cache(self._find)
+        # The same library for calls that take microseconds. They keep Python's lock: a busy thread that gets
+        # it in between may keep it for milliseconds, up to 19 times per step.
+        self.quick = ctypes.PyDLL(driver._name, handle=driver._handle)
         self._context, self._handle, ordinal = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_int()
         self._popped = ctypes.pointer(ctypes.c_void_p())
         # Launch functions that are not in use at the moment.
@@ -109,11 +112,11 @@ class Module:
 
     def push(self) -> None:
         """Make the context of the device current in this thread, which may not have one yet."""
-        self.check("cuCtxPushCurrent_v2", self.driver.cuCtxPushCurrent_v2(self._context))
+        self.check("cuCtxPushCurrent_v2", self.quick.cuCtxPushCurrent_v2(self._context))
 
     def pop(self) -> None:
         """Undo :meth:`push`."""
-        self.check("cuCtxPopCurrent_v2", self.driver.cuCtxPopCurrent_v2(self._popped))
+        self.check("cuCtxPopCurrent_v2", self.quick.cuCtxPopCurrent_v2(self._popped))
 
     def check(self, name: str, status: int) -> None:
         """Raise an error that quotes the driver, unless ``status`` is 0."""
@@ -141,7 +144,7 @@ class _Launch:
 
     def __init__(self, module: Module) -> None:
         self.stream = ctypes.c_void_p()
-        self._module, self._find, self._call = module, module.find, module.driver.cuLaunchKernel
+        self._module, self._find, self._call = module, module.find, module.quick.cuLaunchKernel
         self._buffer, self._size = ctypes.create_string_buffer(8 * MOST_ARGUMENTS), ctypes.c_size_t()
         buffer, size = ctypes.addressof(self._buffer), ctypes.addressof(self._size)
         self._extra = (ctypes.c_void_p * 5)(BUFFER_POINTER, buffer, BUFFER_SIZE, size, END)

@@ -23,8 +23,13 @@ from cadam3d.rasterizer.driver import Module, load_driver
 
 # A driver with all kernels except "unknown". It records launches, and it has no memory for the kernel "full".
 STUB = """
+#include <dlfcn.h>
 #include <string.h>
 extern "C" {
+int stub_locked[4] = {-1, -1, -1, -1};  // whether Python's lock was held: by push, launch, pop, load
+static void note(int call) {
+  if (void* check = dlsym(RTLD_DEFAULT, "PyGILState_Check")) stub_locked[call] = ((int (*)())check)();
+}
 static int pushed = 0;
 static void* current = 0;
 unsigned long long stub_launched[9], stub_streams[256], stub_arguments[32], stub_count = 0;
@@ -32,15 +37,19 @@ int stub_pushed() { return pushed; }
 int cuInit(unsigned) { return 0; }
 int cuDeviceGet(int* device, int ordinal) { *device = ordinal; return 0; }
 int cuDevicePrimaryCtxRetain(void** context, int device) { *context = (char*)0 + 100 + device; return 0; }
-int cuCtxPushCurrent_v2(void* context) { ++pushed; current = context; return 0; }
-int cuCtxPopCurrent_v2(void**) { --pushed; return 0; }
-int cuModuleLoadData(void**, const char* cubin) { return strcmp(cubin, "foreign") == 0 ? 209 : 0; }
+int cuCtxPushCurrent_v2(void* context) { note(0); ++pushed; current = context; return 0; }
+int cuCtxPopCurrent_v2(void**) { note(2); --pushed; return 0; }
+int cuModuleLoadData(void**, const char* cubin) {
+  note(3);
+  return strcmp(cubin, "foreign") == 0 ? 209 : 0;
+}
 int cuModuleGetFunction(void** function, void*, const char* name) {
   *function = &pushed;
   return strcmp(name, "unknown") == 0 ? 500 : strcmp(name, "full") == 0 ? 2 : 0;
 }
 int cuLaunchKernel(void*, unsigned x, unsigned y, unsigned z, unsigned threads_x, unsigned threads_y,
                    unsigned threads_z, unsigned shared, void* stream, void**, void** extra) {
+  note(1);
   const unsigned long long all[] = {x, y, z, threads_x, threads_y, threads_z, shared,
                                     (unsigned long long)stream, (unsigned long long)current};
   memcpy(stub_launched, all, sizeof(all));
@@ -89,6 +98,16 @@ def test_the_context_is_popped_even_after_an_error(stub):
         launch("unknown", 1, inside.append(stub.stub_pushed()) or 32)
     assert inside == [before + 1]
     assert stub.stub_pushed() == before
+
+
+def test_a_launch_keeps_pythons_lock_and_loading_releases_it(stub):
+    """Another thread may hold the lock for milliseconds, which is longer than a step takes."""
+    with Module(stub, 0, b"").launching(0) as launch:
+        launch("some", 1, 32)
+    push, launched, pop, loaded = (ctypes.c_int * 4).in_dll(stub, "stub_locked")
+    if launched == -1:
+        pytest.skip("this interpreter does not export its functions")
+    assert (push, launched, pop, loaded) == (1, 1, 1, 0)
 
 
 def test_a_missing_driver_is_reported_with_a_hint(monkeypatch):
