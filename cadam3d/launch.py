@@ -24,6 +24,7 @@ from cadam3d.settings.options import with_example
 from cadam3d.sweep.plan import require_attempts
 
 EXPORTING = ("render", "export")  # the commands with output=
+MULTIRUN = ("--multirun", "-m")  # flags that make a sweep of a training
 
 
 def launch(command: str, words: Sequence[str]) -> int:
@@ -31,9 +32,11 @@ def launch(command: str, words: Sequence[str]) -> int:
 
     Raises ``UserError`` for mistakes of the user.
     """
+    if command == "train" and any(flag in words for flag in MULTIRUN):
+        command, words = "sweep", [word for word in words if word not in MULTIRUN]
     with explaining(command, words):
         line = read_line(command, words)
-        if line.options.help or line.options.cfg:
+        if line.wants_page:
             _show_page(line)
             return 0
         if command == "sweep":
@@ -63,7 +66,7 @@ def prepare(command: str, words: Sequence[str]) -> tuple[DictConfig, Call]:
     with explaining(command, words):
         line = read_line(command, words)
         shell = f"in a shell: {shlex.join(['cadam3d', command, *words])}"
-        is_single = not (command == "sweep" or line.options.help or line.options.cfg)
+        is_single = command != "sweep" and not line.wants_page
         require(is_single, command, expected="a single run without a page", got=line.words, example=shell)
         cfg = _composed(line)
         attempts = cfg.get("attempts", 1)
@@ -135,10 +138,10 @@ def read_line(command: str, words: Sequence[str]) -> Line:
 
 
 def _show_page(line: Line) -> None:
-    """Print a page: our help, or the settings."""
+    """Print a page: our help, the settings, or one of Hydra's own."""
     if line.options.help:
         show(help_text(line.command, line.overrides, line.folders))
-    elif line.command == "sweep":
+    elif line.command == "sweep" and line.options.cfg:
         from cadam3d.sweep.plan import read_sweep
 
         # The page of a sweep shows the settings of its first job.

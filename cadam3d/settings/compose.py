@@ -62,11 +62,13 @@ def compose(
 ) -> DictConfig:
     """Return the configuration that ``cadam3d <config_name> <overrides>`` would run with.
 
-    The ``flags`` of a line can name one more folder of YAML files; with them, Hydra's own node is kept.
-    Raises Hydra's exceptions, which ``cadam3d.settings.advice`` explains.
+    The ``flags`` of a line can name another configuration and one more folder of YAML files; with them,
+    Hydra's own node is kept. Raises Hydra's exceptions, which ``cadam3d.settings.advice`` explains.
     """
     register_resolvers()
     words, place = list(overrides), "configuration"
+    if flags is not None:
+        config_name = flags.config_name or config_name
     if flags is not None and flags.config_dir is not None:
         place, folder = "--config-dir", Path(flags.config_dir)
         require(folder.is_dir(), place, expected="a folder", got=flags.config_dir, example=f"{place}=.")

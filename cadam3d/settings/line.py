@@ -58,6 +58,12 @@ class Line:
         """Return the folders of YAML files, in the order in which Hydra searches them."""
         return [Path(self.options.config_dir), config_dir()] if self.options.config_dir else [config_dir()]
 
+    @property
+    def wants_page(self) -> bool:
+        """Return whether the line asks for a page, and not for work."""
+        options = self.options
+        return any((options.help, options.cfg, options.hydra_help, options.info))
+
 
 def read_flags(words: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
     """Return the flags of a line, which may be anywhere in it, and its other words, the overrides.
@@ -65,10 +71,13 @@ def read_flags(words: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
     The flags are those of Hydra that are useful here. Raises ``UserError`` for unknown ones.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument("--help", "-h", action="store_true")
-    parser.add_argument("--resolve", action="store_true")
-    parser.add_argument("--config-dir", "-cd")
+    for names in ("--help -h", "--hydra-help", "--resolve"):
+        parser.add_argument(*names.split(), action="store_true")
+    for names in ("--config-dir -cd", "--config-name -cn", "--package -p"):
+        parser.add_argument(*names.split())
     parser.add_argument("--cfg", "-c", choices=("job", "hydra", "all"))
+    pages = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+    parser.add_argument("--info", "-i", nargs="?", const="all", choices=pages)
     try:
         options, overrides = parser.parse_known_args(words)
     except argparse.ArgumentError as error:

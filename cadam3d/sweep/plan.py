@@ -271,7 +271,8 @@ def compose_sweep(parts: Parts, options: Namespace) -> DictConfig:
 
     Raises ``UserError`` for wrong values, and Hydra's exceptions.
     """
-    cfg = compose(parts.own, "sweep", options)
+    # The flag --config-name is for the jobs and not for the sweep itself.
+    cfg = compose(parts.own, "sweep", Namespace(**{**vars(options), "config_name": None}))
     # A wrong setting of the launcher is found now, and not when the jobs are there.
     OmegaConf.to_container(cfg.hydra.launcher, resolve=True)
     is_answer = isinstance(cfg[DRY_RUN], bool)

@@ -47,6 +47,8 @@ from cadam3d.sweep.table import as_text, listing, write_table
 
 LONGEST = 40  # rows of a table in the terminal
 FOLDER_FLAGS = ("--config-dir", "-cd")
+# The flags of a sweep that its jobs need too.
+JOB_FLAGS = (*FOLDER_FLAGS, "--config-name", "-cn")
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,7 @@ def _title(sweep: Sweep, rows: Sequence[Row]) -> str:
 
 def _write_plan(sweep: Sweep, overrides: Sequence[str], flags: Sequence[str]) -> None:
     pending = sum(not row.has_result for row in rows_of(sweep.folder, sweep.jobs))
-    of_jobs = _folder_flags(flags)
+    of_jobs = _flags_named(flags, JOB_FLAGS)
     plan = Plan(
         cwd=str(Path.cwd()),
         flags=of_jobs,
@@ -165,11 +167,11 @@ def _threads(cfg: DictConfig, pending: int) -> int | None:
     return max(1, cores // max(1, min(at_once, pending)))
 
 
-def _folder_flags(flags: Sequence[str]) -> list[str]:
-    """Return the flags that name a folder of YAML files, which the jobs need too, each with its value."""
+def _flags_named(flags: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Return the flags with one of these names, each with its value."""
     kept: list[str] = []
     for position, flag in enumerate(flags):
-        if flag.partition("=")[0] in FOLDER_FLAGS:
+        if flag.partition("=")[0] in names:
             kept += [flag] if "=" in flag else flags[position : position + 2]
     return kept
 
@@ -182,7 +184,7 @@ def _launch(sweep: Sweep, rows: Sequence[Row], flags: Sequence[str]) -> str:
     overrides = [*search_path(sweep.parts.grid), *sweep.parts.launcher, f"job={numbers}"]
     overrides += [f"{SWEEP_FOLDER}={quote(str(sweep.folder))}"]
     try:
-        run_hydra("jobs", [*overrides, *_folder_flags(flags), "--multirun"], worker.run)
+        run_hydra("jobs", [*overrides, *_flags_named(flags, FOLDER_FLAGS), "--multirun"], worker.run)
     except (UserError, HydraException, KeyboardInterrupt):
         raise
     except Exception as error:

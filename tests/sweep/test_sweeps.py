@@ -118,6 +118,11 @@ def only_sweep() -> Path:
 # --- one row per job --------------------------------------------------------------------------------------
 
 
+def test_train_with_a_flag_is_a_sweep(sweep):
+    assert sweep("-m", "prompt=a cube", "seed=0,1", command="train").code == 0
+    assert [row["seed"] for row in read_table(only_sweep())] == ["0", "1"]
+
+
 def test_the_table_has_one_row_per_job(hydra_sweep):
     result = hydra_sweep("prompt=a corgi, front view", "densifier=baseline,cadam", "seed=0,1")
     assert result.code == 0, result.err
@@ -626,6 +631,15 @@ def test_the_plan_records_folder_flags_and_line(sweep, tmp_path):
         *("--config-dir", "own", "prompt='a cube'", "densifier=mine,none", "hydra.sweep.dir='x'")
     ]
     assert [job.swept["densifier"] for job in remembered.jobs] == ["mine", "none"]
+
+
+def test_another_config_name_is_for_the_jobs_only(hydra_sweep, calls, small_configs):
+    """The sweep itself and its launcher keep their own YAML files."""
+    (small_configs / "mine.yaml").write_text(TRAIN.replace("steps: 5", "steps: 6"), encoding="utf-8")
+    flag = ["--config-name", "mine"]
+    result = hydra_sweep(*flag, "prompt=a cube", "seed=0,1", "hydra.sweep.dir=x")
+    assert result.code == 0, result.err
+    assert [call["words"][-3:-1] for call in calls(Path("x"))] == [flag] * 2
 
 
 def test_grids_and_components_are_found_on_a_search_path(sweep, tmp_path):
