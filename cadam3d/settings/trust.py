@@ -30,12 +30,16 @@ from cadam3d.core.checks import fail
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import KINDS, read_text, read_yaml
-from cadam3d.io.run_folder import numbered
+from cadam3d.io.run_folder import expanded, numbered
 from cadam3d.settings.compose import escaped
 from cadam3d.settings.options import TARGET, config_dir
 
 # The last part of a key that names a folder from which this machine loads what it has computed earlier.
 CACHE = "cache_dir"
+# The last parts of keys that are never taken from a run, and why.
+IGNORED = {CACHE: "code may be loaded from there", "entity": "the run would be sent to this account"}
+# Parts of keys that name models on the hub, which would be downloaded into the user's cache.
+HUB = ("ids", "revision", "model", "models", "base", "tokenizer")
 # Characters of all overrides of a run. Hydra's parser needs a second for a thousand brackets.
 LONGEST = 10_000
 # Groups that change how commands run, not what a run computes.
@@ -87,10 +91,14 @@ def judge_overrides(
         if expected := _lacking(override, tuple(folders)):
             _refuse(path, line, expected, retry)
         key = override.key_or_group
-        if key.rpartition(".")[2] != CACHE:
+        if key not in given and _foreign_model(_nested(override), tuple(folders)):
+            expected = "a model that the YAML files of cadam3d name"
+            got = f"got {line[:200]!r}, which may be downloaded. To allow that, type this setting yourself"
+            raise UserError(f"{path}: expected {expected}, {got}. Try: {key}=NAME")
+        if (last := key.rpartition(".")[2]) not in IGNORED:
             kept.append(line)
         elif key not in given:
-            _note_cache(key, path)
+            _note_ignored(key, path, IGNORED[last])
     return kept
 
 
@@ -121,8 +129,10 @@ def read_components(
         if not is_trusted:
             if unknown := _unknown(node, tuple(folders)):
                 _refuse(path, f"{key}: {unknown}", "components that this version of cadam3d has", retry)
+            if name := _foreign_model(node, tuple(folders)):
+                _refuse(path, f"{key}: {name}", "models that the YAML files of cadam3d name", retry)
             if node.get(CACHE) is not None:
-                _note_cache(f"{key}.{CACHE}", path)
+                _note_ignored(f"{key}.{CACHE}", path, IGNORED[CACHE])
                 node[CACHE] = None
     return DictConfig(escaped(chosen))
 
@@ -175,15 +185,21 @@ def _lacking(override: Override, folders: tuple[Path, ...]) -> str:
         names = value if isinstance(value, list) else [value]
         if not all(name is None or (isinstance(name, str) and OPTION.fullmatch(name)) for name in names):
             return "the name of an option"
-    node: Any = value
-    for part in reversed(re.split(r"[./]", key)):
-        node = {part: node}
-    if _unknown(node, folders):
-        return "plain values and components that this version of cadam3d has"
+    if _unknown(_nested(override), folders) or any(name in IGNORED for name, _ in _pairs(value)):
+        without = f"without {' or '.join(IGNORED)} in a value"
+        return f"plain values and components that this version of cadam3d has, {without}"
     texts = [text for _, text in _pairs([value]) if isinstance(text, str)]
     if any(INTERPOLATION.search(REFERENCE.sub("_", text)) for text in texts):
         return "interpolations that only refer to other settings"
     return ""
+
+
+def _nested(override: Override) -> Any:
+    """Return the value of an override inside dicts with the parts of its key."""
+    node: Any = override.value()
+    for part in reversed(re.split(r"[./]", override.key_or_group)):
+        node = {part: node}
+    return node
 
 
 def _root(line: str) -> str:
@@ -192,11 +208,38 @@ def _root(line: str) -> str:
 
 
 @cache  # a sweep has many runs
-def _known_targets(folders: tuple[Path, ...]) -> frozenset[str]:
-    """Return the targets that the YAML files of all groups of components in ``folders`` name."""
+def _yaml_texts(folders: tuple[Path, ...]) -> tuple[str, ...]:
+    """Return the YAML files of all groups of components in ``folders``, as text."""
     groups = [path.name for path in config_dir().iterdir() if path.is_dir() and path.name not in MACHINERY]
     files = [path for folder in folders for group in groups for path in (folder / group).rglob("*.yaml")]
-    return frozenset([CONSTANT]).union(*(NAMED_TARGET.findall(read_text(path)) for path in files))
+    return tuple(map(read_text, files))
+
+
+@cache
+def _known_targets(folders: tuple[Path, ...]) -> frozenset[str]:
+    """Return the targets that the YAML files of all groups of components in ``folders`` name."""
+    return frozenset([CONSTANT]).union(*map(NAMED_TARGET.findall, _yaml_texts(folders)))
+
+
+def _foreign_model(node: Any, folders: tuple[Path, ...]) -> str:
+    """Return the first name of a model that neither a YAML file names nor this disk has; "" if none is."""
+    for name in _hub_names(node):
+        named = re.compile(rf"(?<![\w./@-]){re.escape(name)}(?![\w./@-])")
+        if not any(map(named.search, _yaml_texts(folders))) and not os.path.lexists(expanded(name)):
+            return name
+    return ""
+
+
+def _hub_names(node: Any, is_name: bool = False) -> Iterator[str]:
+    """Yield the texts in plain data that may name models on the hub, or versions of them."""
+    if isinstance(node, dict):
+        for key, value in node.items():
+            yield from _hub_names(value, is_name or key in HUB)
+    elif isinstance(node, list | tuple):
+        for each in node:
+            yield from _hub_names(each, is_name)
+    elif is_name and isinstance(node, str):
+        yield node
 
 
 def _unknown(node: Any, folders: tuple[Path, ...]) -> str:
@@ -225,5 +268,5 @@ def _refuse(path: Path, found: str, expected: str, retry: str) -> NoReturn:
     raise UserError(f"{path}: expected {expected}, got {found[:200]!r}. {code} Try: {retry}")
 
 
-def _note_cache(key: str, path: Path) -> None:
-    say(f"Note: {key} in {path} is ignored, because code may be loaded from there.", logging.WARNING)
+def _note_ignored(key: str, path: Path, why: str) -> None:
+    say(f"Note: {key} in {path} is ignored, because {why}.", logging.WARNING)

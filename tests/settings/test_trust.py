@@ -383,6 +383,56 @@ def test_the_cache_of_a_configuration_is_ignored_with_a_note(config, tmp_path, c
     assert components_of(config, tmp_path, is_trusted=True).rasterizer.cache_dir == "/planted"
 
 
+# --- models and accounts ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "prior.ids=[evil/model]",
+        "prior.ids=[stable-diffusion-v1-5/stable-diffusion-v1-5,evil/model]",
+        "prior.ids=['${prompt}']",
+        "+prior={ids: [evil/model]}",
+        "prior.revision=refs/pr/5",
+        "prior.tokenizer=evil/words",
+        "initializer.fallback={_target_: cadam3d.initializer.shap_e.ShapE, ids: [evil/model]}",
+        "metric.clip_score.model=evil/clip@main",
+        "protocol.models.vqa=evil/vqa",
+    ],
+)
+def test_a_model_that_no_yaml_file_names_is_not_downloaded_for_a_run(line, capsys):
+    with pytest.raises(UserError) as caught:
+        judged(line)
+    assert "Try: " in str(caught.value)
+
+
+def test_models_of_the_package_on_this_disk_or_in_the_line_are_accepted(tmp_path):
+    accepted = [
+        "prior.ids=[stable-diffusion-v1-5/stable-diffusion-v1-5]",
+        "initializer.ids=[openai/shap-e]",
+        f"metric.clip_score.model={tmp_path}",
+        "prior.revision=null",
+        "metric.hps.model=null",
+    ]
+    assert judged(*accepted) == accepted
+    # The line sets the same key, so its own value is used.
+    judge_overrides(["prior.ids=[evil/model]"], Path("x"), ("prior.ids",), [CONFIGS], RETRY)
+
+
+def test_a_configuration_cannot_name_a_model_either(config, tmp_path):
+    config["prior"]["ids"] = ["evil/model"]
+    with pytest.raises(UserError, match="got 'prior: evil/model'"):
+        components_of(config, tmp_path)
+    components_of(config, tmp_path, is_trusted=True)
+
+
+def test_a_run_does_not_choose_the_account_that_it_is_sent_to(capsys):
+    assert judged("callback=[wandb]", "callback.wandb.entity=evil") == ["callback=[wandb]"]
+    assert "Note: callback.wandb.entity in overrides.yaml is ignored" in capsys.readouterr().err
+    with pytest.raises(UserError, match="without cache_dir or entity"):
+        judged("+callback.own={_target_: cadam3d.callback.wandb.Wandb, entity: evil}")
+
+
 # --- links ------------------------------------------------------------------------------------------------
 
 
