@@ -19,8 +19,11 @@ from cadam3d.io.run_folder import (
     expanded,
     nearest_existing,
     not_writable,
+    numbered,
     remove_empty,
     require_writable,
+    setting_word,
+    shown,
     spare,
     typed_path,
 )
@@ -88,12 +91,12 @@ def write_files(
     text = str(asset.folder / name if output is None else output)
     target = expanded(text)
     if not text.strip() or typed_path(text).parent == typed_path(text):
-        raise fail("output", expected="a file or a folder", got=text, example=f"output={name}")
+        raise fail("output", expected="a file or a folder", got=text, example=_free(Path(name)))
     try:
         if output is not None and names_file(text):
             return [_one_file(target, into_file)]
         if os.path.lexists(target) and not target.is_dir():
-            raise fail("output", expected="a folder", got=text, example=f"output={name}")
+            raise fail("output", expected="a folder", got=text, example=_free(target))
         existing = nearest_existing(target)
         target.mkdir(parents=True, exist_ok=True)
         require_writable(target)
@@ -103,6 +106,11 @@ def write_files(
         return into_folder(target)
     finally:
         remove_empty(target, existing)
+
+
+def _free(folder: Path) -> str:
+    """Return the argument for a folder like ``folder`` that does not exist yet."""
+    return setting_word("output", f"{shown(numbered(folder, first=1))}/")
 
 
 def _one_file(target: Path, write: WriteFn) -> Output:
@@ -118,7 +126,7 @@ def _one_file(target: Path, write: WriteFn) -> Output:
             suffixes = sorted({suffix_in(output.path.name) for output in outputs})
             if len(outputs) != 1 or not target.name.lower().endswith(suffixes[0]):
                 expected = f"a folder, because {len(outputs)} file(s) with {'|'.join(suffixes)} are written"
-                example = f"output={target.stem}/"
+                example = _free(target.with_name(target.name.partition(".")[0]))
                 raise fail("output", expected=expected, got=str(target), example=example)
             return replace(outputs[0], path=outputs[0].path.replace(target))
     finally:

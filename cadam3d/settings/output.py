@@ -5,7 +5,7 @@ from pathlib import Path
 
 from cadam3d.core.checks import fail
 from cadam3d.exporter.base import Exporter, exporters_by_suffix
-from cadam3d.io.run_folder import expanded, setting_word
+from cadam3d.io.run_folder import expanded, numbered, setting_word
 from cadam3d.settings.compose import value_of
 from cadam3d.settings.line import is_list, key_of, text_of
 from cadam3d.settings.options import option_class, option_names
@@ -40,7 +40,8 @@ def exporting(overrides: Sequence[str], folders: Sequence[Path] = ()) -> list[st
     suffix = suffix_of(name, by_suffix)
     if suffix not in by_suffix and not named and "exporter" not in given:
         expected = f"a file with suffix {'|'.join(by_suffix)}, or a folder"
-        example = INSTEAD.get(suffix) or setting_word("output", f"{name}/")
+        free = numbered(Path(name), first=1)
+        example = INSTEAD.get(suffix) or setting_word("output", f"{free}/")
         raise fail("output", expected=expected, got=name, example=example)
     if "exporter" in given:
         value = value_of(given["exporter"])

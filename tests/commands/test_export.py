@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shlex
 import threading
 from pathlib import Path
 
@@ -350,6 +351,51 @@ def test_the_lines_about_a_file_name_its_size_content_and_axes(run_folder, type_
     size = Path("out/asset.ply").stat().st_size
     assert first == f"out/asset.ply  {size / 1e6:.3f} MB, 6 Gaussians, -y up"
     assert last.endswith("describes these files")
+
+
+# --- hints and assets -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("output=",),
+        ("output=taken",),
+        ("output=asset.ply", "exporter=[ply,glb]"),
+        ("output=taken.xyz",),
+    ],
+)
+def test_no_hint_writes_to_a_path_that_exists(run_folder, type_line, tmp_path, words):
+    for name in ("exports", "asset"):
+        (tmp_path / name).mkdir()
+    for name in ("taken", "taken.xyz"):
+        (tmp_path / name).write_text("mine")
+    done = type_line("export", f"run={run_folder}", *words)
+    assert done.code == 1
+    [hint] = shlex.split(done.message.partition(" Try: ")[2])
+    assert hint.startswith("output=")
+    assert not Path(hint.removeprefix("output=")).exists()
+    assert type_line("export", f"run={run_folder}", *words[1:], hint).code == 0
+
+
+@pytest.mark.parametrize("kind", ["sog", "ksplat", "splat", "spz", "glb", "compressed.ply"])
+@pytest.mark.parametrize("command", ["render", "export"])
+def test_another_format_beside_an_asset_costs_the_asset_nothing(type_line, tmp_path, kind, command):
+    if kind in ("sog", "ksplat"):
+        pytest.importorskip("gaussforge")
+    write_ply(tmp_path / "asset.ply", make_gaussians(6, degree=0), up="-y", pad_sh=0)
+    asset = (tmp_path / "asset.ply").read_bytes()
+    assert type_line("export", "ply=asset.ply", f"output=asset.{kind}").code == 0
+    words = [
+        "exporter=[images]",
+        "exporter.images.views=1",
+        "exporter.images.size=16",
+        "rasterizer=reference",
+    ]
+    done = type_line(command, f"ply=asset.{kind}", *(words if command == "render" else []))
+    assert done.code == 0
+    assert "Try: " not in done.err
+    assert (tmp_path / "asset.ply").read_bytes() == asset
 
 
 # --- wrong places -----------------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cadam3d.core.console import followed
 from cadam3d.core.gaussians import Gaussians
 
 CUTOFF = 3.0  # standard deviations
@@ -179,7 +180,7 @@ def _runs(some: Blobs, grid: Lattice, blur: float, longest: int) -> Iterator[_Ru
     ends = (wide[:, 0] * wide[:, 1]).cumsum(0)
     count = int(ends[-1]) if len(ends) else 0
     share = max(1, AT_ONCE // longest)
-    for start in range(0, count, share):
+    for start in followed(range(0, count, share), "surface: Gaussians on a grid"):
         column = torch.arange(start, min(start + share, count))
         g = torch.searchsorted(ends, column, right=True)
         column -= (ends - wide[:, 0] * wide[:, 1])[g]

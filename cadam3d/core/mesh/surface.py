@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cadam3d.core.checks import fail, require_range, require_whole
+from cadam3d.core.console import followed
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.mesh.density import BLUR, CUTOFF, Blobs, Lattice, blobs, density, grid_around, near
@@ -204,7 +205,7 @@ def simplified(
     target = float(triangles)
     while target < len(faces):
         # The order in which edges collapse depends on the aggressiveness, and so does whether a hole appears.
-        for aggressiveness in AGGRESSIVENESS:
+        for aggressiveness in followed(AGGRESSIVENESS, f"surface: {len(faces):,} to {target:,.0f} triangles"):
             points, corners, *_ = fast_simplification.simplify(
                 vertices, faces.astype(np.int32), target_count=int(target), agg=aggressiveness
             )
