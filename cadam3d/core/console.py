@@ -80,6 +80,5 @@ def working(label: str) -> Iterator[Callable[[], object]]:
     """
     from tqdm import tqdm  # slow to import
 
-    look = "{desc}: {elapsed}, Ctrl-C ends it"
-    with tqdm(desc=label, bar_format=look, leave=False, delay=DELAY_S, disable=None) as bar:
+    with tqdm(desc=label, bar_format="{desc}: {elapsed}", leave=False, delay=DELAY_S, disable=None) as bar:
         yield lambda: bar.update(1)

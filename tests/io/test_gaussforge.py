@@ -1,5 +1,8 @@
 """SOG, ksplat and SPZ version 4 through gaussforge: the same object, the expected layout, clear refusals."""
 
+import signal
+import time
+
 import numpy as np
 import pytest
 import torch
@@ -15,7 +18,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io import gaussforge
 from cadam3d.io.frames import world_to_file
-from cadam3d.io.gaussforge import write_ksplat, write_sog, write_spz4
+from cadam3d.io.gaussforge import read_forged, write_ksplat, write_sog, write_spz4
 
 pytest.importorskip("gaussforge")
 WRITERS = {"sog": write_sog, "ksplat": write_ksplat, "spz": write_spz4}
@@ -81,3 +84,31 @@ def test_without_the_package_the_message_names_the_extra(tmp_path, monkeypatch, 
     message = rf"exporter\.{kind}: needs gaussforge, which is not installed\. {hint}"
     with pytest.raises(UserError, match=message):
         WRITERS[kind](tmp_path / "a", random_gaussians(3), up="-y")
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="no timers")
+def test_ctrl_c_ends_the_work_of_gaussforge_at_once(tmp_path, monkeypatch):
+    mark = tmp_path / "mark"
+    waiting = f"import time; time.sleep(5); open({str(mark)!r}, 'w')"
+    monkeypatch.setattr(gaussforge, "PROGRAM", waiting)
+
+    def press(number, frame):
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, press)
+    signal.setitimer(signal.ITIMER_REAL, 0.7)
+    start = time.monotonic()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            write_sog(tmp_path / "a.sog", random_gaussians(3), up="-y")
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert time.monotonic() - start < 4
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_crash_of_gaussforge_is_one_message(tmp_path, monkeypatch):
+    monkeypatch.setattr(gaussforge, "PROGRAM", "import os; os.abort()")
+    (tmp_path / "a.sog").write_bytes(b"PK\3\4")
+    with pytest.raises(UserError, match=r"a\.sog: gaussforge cannot read it \(it ended with -?\d+\)"):
+        read_forged(tmp_path / "a.sog", "sog")
