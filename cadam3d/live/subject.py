@@ -92,6 +92,7 @@ class ShownRun(ShownFile):
     def state(self) -> dict[str, Any]:
         """Return what the page shows beside the picture, and tell the run that a page is open."""
         is_writable = live.touch_watched(self.place)
+        is_at_work = is_held(self.place / LOCK)  # and what it has made before is not its result
         config = self._keep(CONFIG, lambda: read_config(self.place / CONFIG)) or {}
         now, curves = self._live(), self._curves()
         title, total = config.get("prompt"), config.get("steps")
@@ -104,8 +105,8 @@ class ShownRun(ShownFile):
             "picture": self._version(LIVE_SNAPSHOT if self._shows_snapshot(now) else ASSET),
             "charts": f"{self._version(METRICS)} {self._version(CHARTS)}",
             "saved": self._saved(),
-            "has_asset": self._version(ASSET) is not None,
-            "has_report": self._version(REPORT) is not None,
+            "has_asset": not is_at_work and self._version(ASSET) is not None,
+            "has_report": not is_at_work and self._version(REPORT) is not None,
             "total_steps": total if is_whole(total) else None,
         }
         if now is not None:
@@ -115,7 +116,7 @@ class ShownRun(ShownFile):
             newest = now | log if log["step"] > now["step"] else log | now
             return facts | newest | {"status": status, "asked": asked, "is_writable": is_writable}
         facts |= log
-        if is_held(self.place / LOCK):
+        if is_at_work:
             return facts | {"status": "busy"}
         summary = self._keep(SUMMARY, lambda: read_summary(self.place)) or {}
         done = {key: summary.get(key) for key in ("num_gaussians", "seconds", "outcome")}

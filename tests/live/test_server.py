@@ -173,6 +173,7 @@ def test_a_run_that_begins_while_the_page_is_open_becomes_live_and_ends_again(br
         state = browser.json("state")
         assert (state["status"], state["step"], state["num_gaussians"]) == ("training", 11, 5)
         assert state["is_writable"]
+        assert (state["has_report"], state["has_asset"]) == (False, False), "those are of the earlier run"
         assert state["picture"] != before
         assert browser.get("picture")[2] == pack(make_gaussians(5))
         assert (run / "live/watched").exists()
