@@ -39,7 +39,11 @@ def facing(truth: Truth, render: RenderFn) -> Truth:
     if truth.turns is None:
         return truth
     step = 360.0 / truth.turns
-    coarse = _rings(truth.turns)
+    azimuth = torch.arange(truth.turns).repeat(len(ELEVATIONS_DEG)) * (360.0 / truth.turns)
+    elevation = torch.tensor(ELEVATIONS_DEG).repeat_interleave(truth.turns)
+    full = torch.ones_like(azimuth)
+    # One ring of views for each elevation.
+    coarse = orbit(azimuth, elevation, full * fitting_distance(FOV_DEG), full * FOV_DEG, SIZE, SIZE)
     asset = _over_white(lambda cameras, white: render(cameras, white).rgb, coarse).clamp(0, 1)
     true = _over_white(truth.images, coarse)
     # A ring has one view per turn, so an object that turns by one step moves every image to the next view.
@@ -59,14 +63,6 @@ def facing(truth: Truth, render: RenderFn) -> Truth:
         best = max(known, key=lambda turn_deg: known[turn_deg])
     is_gain = known[best] - known[0.0] >= LEAST_GAIN
     return replace(truth, turn_deg=round(180.0 - (180.0 - best) % 360.0, 3) if is_gain else 0.0)
-
-
-def _rings(views: int) -> Cameras:
-    """Return one ring of views for each elevation, from azimuth 0 on."""
-    azimuth = torch.arange(views).repeat(len(ELEVATIONS_DEG)) * (360.0 / views)
-    elevation = torch.tensor(ELEVATIONS_DEG).repeat_interleave(views)
-    full = torch.ones_like(azimuth)
-    return orbit(azimuth, elevation, full * fitting_distance(FOV_DEG), full * FOV_DEG, SIZE, SIZE)
 
 
 def _over_white(
