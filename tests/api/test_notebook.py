@@ -16,13 +16,18 @@ LARGEST = 1.5e6  # bytes
 
 
 @pytest.mark.slow
-def test_the_notebook_runs(tmp_path, monkeypatch):
+def test_the_notebook_runs_and_leaves_no_files_behind(tmp_path, monkeypatch):
+    for folder in ("here", "temporary"):
+        (tmp_path / folder).mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
     monkeypatch.setenv("CADAM3D_NOTEBOOK_STEPS", "3")
     monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))
     notebook = nbformat.read(NOTEBOOK, as_version=4)
-    resources = {"metadata": {"path": str(tmp_path)}}
+    resources = {"metadata": {"path": str(tmp_path / "here")}}
     nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3", resources=resources).execute()
-    assert (tmp_path / "torus.glb").is_file()
+    assert "torus.glb: " in str(notebook.cells)
+    assert not list((tmp_path / "here").iterdir())
+    assert not list((tmp_path / "temporary").rglob("*.ply"))
 
 
 @pytest.fixture(scope="module")
