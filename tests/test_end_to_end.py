@@ -14,6 +14,7 @@ import imageio.v3 as iio
 import pytest
 
 from cadam3d import cli
+from cadam3d.core.signals import ENDING
 from cadam3d.io.jsonl import read_jsonl
 from cadam3d.io.lock import INHERITED
 from cadam3d.io.ply import read_ply
@@ -152,7 +153,7 @@ def test_a_run_starts_without_slow_imports(finished):
         assert name not in before_second_step
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", ENDING)
 def test_a_signal_saves_everything_and_prints_how_to_continue(tmp_path, number):
     run_folder = tmp_path / "run"
     process = start(tmp_path, "train", *BARE, f"hydra.run.dir={run_folder}", "callback.checkpoint.every=5")

@@ -1,7 +1,6 @@
 """``cadam3d train``: optimise an asset for a prompt and write it into a run folder."""
 
 import logging
-import signal
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -25,7 +24,7 @@ from cadam3d.commands.resuming import keep_start, start_or_resume
 from cadam3d.core.checks import require_whole
 from cadam3d.core.console import say
 from cadam3d.core.device import resolve_device
-from cadam3d.core.signals import StopOnSignal
+from cadam3d.core.signals import ENDING, StopOnSignal
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.declarations import write_declarations
 from cadam3d.io.occupied import occupied
@@ -37,7 +36,7 @@ log = logging.getLogger(__name__)
 
 def run(cfg: DictConfig, call: Call) -> int:
     """Train and print the result. Return the exit code, which is 128 plus its number after a signal."""
-    stop = StopOnSignal((signal.SIGINT, signal.SIGTERM))
+    stop = StopOnSignal(ENDING)
     folder, summary = optimise(cfg, call, stop)
     print_result(folder, summary)
     # This also applies if all steps were done already, so that a loop in a shell script ends.

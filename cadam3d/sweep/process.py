@@ -19,6 +19,7 @@ from pathlib import Path
 
 from cadam3d.core.console import say
 from cadam3d.core.outcome import Outcome
+from cadam3d.core.signals import ENDING
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.lock import INHERITED, describe_holder, take, unlock
 from cadam3d.io.records import read_summary
@@ -31,7 +32,7 @@ PACKAGE_ROOT = Path(__file__).parents[2]
 POLL_SECONDS = 0.2
 IS_WINDOWS = sys.platform == "win32"
 # Exit codes of a process that was asked to stop.
-STOPPED = (128 + signal.SIGINT, 128 + signal.SIGTERM, -signal.SIGINT, -signal.SIGTERM)
+STOPPED = (*(128 + number for number in ENDING), *(-number for number in ENDING))
 # Slurm sends one of these signals to a launcher shortly before it ends it. Windows does not have them.
 ANNOUNCING = tuple(getattr(signal, name) for name in ("SIGUSR1", "SIGUSR2") if hasattr(signal, name))
 KILL = getattr(signal, "SIGKILL", signal.SIGTERM)
@@ -153,10 +154,10 @@ def _wait(plan: Plan, row: Row, stop: Path, lock: int) -> int:
 def _signals() -> Iterator[list[int]]:
     """Yield a list to which signals are added as they arrive, unless this process already handles them.
 
-    The process of the sweep itself handles signals in ``start.py``. In a worker of a launcher, SIGTERM is
-    collected here for the running job. Ctrl-C is ignored from now on, even between two jobs, because the
-    process of the sweep handles it. The signal with which Slurm announces the end of a job's time is raised
-    again once the job has saved, because the launcher then queues the job again.
+    The process of the sweep itself handles signals in ``start.py``. In a worker of a launcher, SIGTERM and
+    SIGHUP are collected here for the running job. Ctrl-C is ignored from now on, even between two jobs,
+    because the process of the sweep handles it. The signal with which Slurm announces the end of a job's time
+    is raised again once the job has saved, because the launcher then queues the job again.
     """
     received: list[int] = []
     unhandled = (signal.default_int_handler, signal.SIG_IGN, signal.SIG_DFL)
@@ -168,7 +169,8 @@ def _signals() -> Iterator[list[int]]:
     announcing = [number for number in ANNOUNCING if callable(signal.getsignal(number))]
     previous = {
         number: signal.signal(number, lambda number, _frame: received.append(number))
-        for number in (signal.SIGTERM, *announcing)
+        for number in (*ENDING[1:], *announcing)
+        if signal.getsignal(number) != signal.SIG_IGN  # as under nohup
     }
     try:
         yield received

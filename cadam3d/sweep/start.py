@@ -5,7 +5,6 @@ The same line always has the same folder, so typing the line again continues the
 
 import os
 import shlex
-import signal
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d.core.checks import fail
 from cadam3d.core.console import complain, show
 from cadam3d.core.errors import UserError
-from cadam3d.core.signals import StopOnSignal
+from cadam3d.core.signals import ENDING, StopOnSignal
 from cadam3d.io.lock import locked
 from cadam3d.io.occupied import in_use
 from cadam3d.io.records import read_config
@@ -84,7 +83,7 @@ def run_sweep(
         return Ended(folder, 0, was_dry=True)
     claim(folder, sweep.folder_key, is_chosen=True)
     lock = locked(folder / LOCK, lambda holder: in_use(folder, holder, sweep.folder_key))
-    stop = StopOnSignal((signal.SIGINT, signal.SIGTERM), (folder / STOP).touch)
+    stop = StopOnSignal(ENDING, (folder / STOP).touch)
     with lock, stop:
         (folder / STOP).unlink(missing_ok=True)
         _refuse_occupied(folder, sweep.folder_key)
