@@ -18,6 +18,7 @@ KEYS = {
     "size": 64,
     "noise_levels": "table",
     "dtype": "float32",
+    "vae_dtype": "auto",
     "micro_batch": None,
     "compile": False,
     "text_device": "auto",

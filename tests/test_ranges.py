@@ -52,6 +52,7 @@ BEYOND = {
     "prior=shapes_flow": "noise_path.shift=0 noise_path.shift=.nan",
     "prior=tiny": "predicts=clean width=20 width=64 downscale=0 seed=-1",
     "prior=stable_diffusion": "size=100 size=0 dtype=int8 micro_batch=0 text_device=moon noise_levels=whole",
+    "prior=sdxl": "vae_dtype=float16",
     "prior=mvdream": "micro_batch=1 micro_batch=6 rescale=1.5 rescale=-0.1",
     "prompting=discrete": "back_deg=170 front_deg=-1",
     "prompting=compass": "below_deg=-91 above_deg=-30",

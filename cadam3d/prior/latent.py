@@ -46,6 +46,8 @@ LARGEST = 2
 # In float16, the largest element of a view's gradient on its latents is brought between 2 ** (LIFT - 1) and
 # 2 ** LIFT. That is in the middle between the numbers that are rounded to zero and those that overflow.
 LIFT = 3
+# The first compute capability of NVIDIA's GPUs with bfloat16.
+BFLOAT16 = (8, 0)
 # Numbers that the autoencoder keeps for a backward pass, per pixel and per channel of its first layer. All
 # models of this family have the same layers.
 KEPT = 24
@@ -94,7 +96,7 @@ class LatentPrior(DiffusionPrior):
     the released code draws from it. ``micro_batch`` limits the number of images in a network at a time: the
     autoencoder then runs again in the backward pass, part by part, so that memory does not grow with the
     number of views. The gradient does not change. With ``dtype`` "auto" the networks use ``half`` on CUDA and
-    float32 elsewhere.
+    float32 elsewhere; :attr:`torch_dtype` has the exception.
     """
 
     path: str | Sequence[str] | None  # folder, or package: and a name; or a list of these
@@ -105,6 +107,7 @@ class LatentPrior(DiffusionPrior):
     size: int | None  # pixels per side
     noise_levels: str  # one of LEVELS
     dtype: str  # auto or one of DTYPES
+    vae_dtype: str  # auto, bfloat16 or float32
     micro_batch: int | None  # images
     compile: bool
     text_device: str  # auto or cpu
@@ -123,6 +126,7 @@ class LatentPrior(DiffusionPrior):
             require(is_possible, "prior.size", expected=f"a multiple of {unit}", got=self.size)
         require_choice("prior.noise_levels", self.noise_levels, LEVELS)
         require_choice("prior.dtype", self.dtype, ("auto", *DTYPES))
+        require_choice("prior.vae_dtype", self.vae_dtype, ("auto", "bfloat16", "float32"))
         unless_none(require_whole, "prior.micro_batch", self.micro_batch, low=1)
         require_choice("prior.text_device", self.text_device, ("auto", "cpu"))
 
@@ -256,10 +260,14 @@ class LatentPrior(DiffusionPrior):
 
     @property
     def torch_dtype(self) -> torch.dtype:
-        """Return the dtype that the networks compute in."""
+        """Return the dtype that the networks compute in. GPUs without bfloat16 compute in float16 instead."""
         if self.dtype != "auto":
             return DTYPES[self.dtype]
-        return DTYPES[self.half] if self.device.type == "cuda" else torch.float32
+        if self.device.type != "cuda":
+            return torch.float32
+        # Torch emulates bfloat16 on older GPUs, which is slower than float32.
+        has_bfloat16 = torch.cuda.get_device_capability(self.device) >= BFLOAT16
+        return DTYPES[self.half] if has_bfloat16 else torch.float16
 
     @cached_property
     def source(self) -> ModelSource:
@@ -298,19 +306,26 @@ class LatentPrior(DiffusionPrior):
     @cached_property
     def vae(self) -> Any:
         """Return the autoencoder, frozen and on the device."""
-        vae = self.found.part("vae", self._vae_dtype).to(self.device)
+        vae = self._placed("vae", self._vae_dtype)
         number_in(vae.config, "scaling_factor", 1e-3, 1e3)
         if vae.config.shift_factor is not None:
             number_in(vae.config, "shift_factor", -1e3, 1e3)
+        if self.compile:
+            # Each is compiled at its first call. Most objectives never decode.
+            vae.encoder.compile()
+            vae.decoder.compile()
         return vae
 
     @cached_property
     def network(self) -> Any:
         """Return the denoiser, frozen and on the device."""
-        network = self.found.part(self.network_part, self.torch_dtype).to(self.device)
-        if self.device.type == "cuda":
-            network = network.to(memory_format=torch.channels_last)
+        network = self._placed(self.network_part, self.torch_dtype)
         return torch.compile(network) if self.compile else network
+
+    def _placed(self, part: str, dtype: torch.dtype) -> Any:
+        """Load a network to the device, with the layout in which its convolutions are fast there."""
+        network = self.found.part(part, dtype).to(self.device)
+        return network.to(memory_format=torch.channels_last) if self.device.type == "cuda" else network
 
     @cached_property
     def _place(self) -> dict[str, torch.device]:
@@ -318,6 +333,8 @@ class LatentPrior(DiffusionPrior):
 
     @property
     def _vae_dtype(self) -> torch.dtype:
+        if self.vae_dtype != "auto":
+            return DTYPES[self.vae_dtype]
         overflows = self.upcasts and self.torch_dtype == torch.float16
         return torch.float32 if overflows else self.torch_dtype
 

@@ -35,7 +35,7 @@ class StableDiffusion3(LatentPrior):
     kinds: ClassVar = ("StableDiffusion3Pipeline",)
     network_part: ClassVar = "transformer"
     half: ClassVar = "bfloat16"
-    upcasts: ClassVar = False
+    upcasts: ClassVar = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

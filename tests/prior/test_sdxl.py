@@ -83,3 +83,10 @@ def test_networks_compute_in_16_bits_and_return_float32(prior):
 )
 def test_the_autoencoder_never_computes_in_float16(prior, dtype, expected):
     assert replace(prior, dtype=dtype).vae.dtype == expected
+
+
+@pytest.mark.parametrize("vae_dtype", ["bfloat16", "float32"])
+def test_the_autoencoder_may_have_its_own_precision(prior, vae_dtype):
+    other = replace(prior, dtype="float16", vae_dtype=vae_dtype)
+    assert (other.vae.dtype, other.torch_dtype) == (getattr(torch, vae_dtype), torch.float16)
+    assert other.encode(torch.rand(1, 64, 64, 3)).dtype == torch.float32

@@ -1,5 +1,7 @@
 """Stable Diffusion as a prior, compared with the parts of the pipeline, on tiny models from files."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from latents import KEYS, encodes_like_the_autoencoder, micro_batch_changes_nothing, normal
@@ -266,6 +268,44 @@ def test_a_model_that_is_not_on_disk_is_lacking_and_the_hub_is_not_queried(make,
     assert "a/one, b/two" in make(path=None, ids=["a/one", "b/two"]).lacks()
     assert asked == [True, True]
     assert "expected a folder with a model_index.json" in make(path="/nowhere").lacks()
+
+
+# --- layout and compilation ------------------------------------------------------------------------------
+
+
+class Recording(torch.nn.Module):
+    """A network that records how it is moved and compiled, and stays on the CPU."""
+
+    def __init__(self, calls, config):
+        super().__init__()
+        self.calls, self.config = calls, config
+
+    def to(self, *args, **options):
+        self.calls += [*args, *options.values()]
+        return self
+
+    def compile(self):
+        self.calls.append("compiled")
+
+
+@pytest.mark.parametrize("device", [torch.device("cuda"), torch.device("cpu")])
+def test_both_networks_have_the_layout_of_the_device_and_are_compiled(make, device, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, 0))
+    monkeypatch.setattr(torch, "compile", lambda network: network.compile() or network)
+    prior, calls = make(compile=True).to(device), {"vae": [], "unet": []}
+
+    config = diffusers.configuration_utils.FrozenDict(scaling_factor=0.18, shift_factor=None)
+
+    def part(name, dtype):
+        network = Recording(calls[name], config)
+        vars(network)["encoder"] = vars(network)["decoder"] = network
+        return network
+
+    vars(prior)["found"] = SimpleNamespace(part=part)
+    prior.load()
+    layout = [torch.channels_last] if device.type == "cuda" else []
+    assert calls["vae"] == [device, *layout, "compiled", "compiled"]
+    assert calls["unet"] == [device, *layout, "compiled"]
 
 
 # --- impossible values ------------------------------------------------------------------------------------

@@ -147,6 +147,16 @@ def test_networks_compute_in_16_bits_and_return_float32(prior):
     computes_in_sixteen_bits(prior, condition_of)
 
 
+@pytest.mark.parametrize(
+    ("capability", "network", "autoencoder"),
+    [((7, 5), torch.float16, torch.float32), ((8, 0), torch.bfloat16, torch.bfloat16)],
+)
+def test_a_gpu_without_bfloat16_computes_in_float16(prior, monkeypatch, capability, network, autoencoder):
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
+    there = replace(prior, dtype="auto").to(torch.device("cuda"))
+    assert (there.torch_dtype, there._vae_dtype) == (network, autoencoder)
+
+
 def test_memory_is_estimated(prior):
     memory_is_estimated(prior)
 
