@@ -251,9 +251,12 @@ def read_model(kind: Any, where: str | Path, refuse: Callable[[str], UserError],
     if kind.__module__.startswith("transformers."):
         options["trust_remote_code"] = False
     with refused_by(refuse, f"its {kind.__name__} cannot be loaded"):
-        for file in Path(where, options.get("subfolder", "")).glob("*.bin"):
+        files = [file for file in Path(where, options.get("subfolder", "")).glob("*") if not file.is_dir()]
+        for file in files:
+            # This refuses a pipe, for which a reader would wait.
             with open_regular(file) as opened:
-                require_finite(opened)
+                if file.suffix == ".bin":
+                    require_finite(opened)
         return kind.from_pretrained(where, local_files_only=Path(where).is_dir(), **options)
 
 

@@ -1,6 +1,7 @@
 """A model folder may come from a stranger: nothing in it runs, and every damage is one line."""
 
 import json
+import os
 import pickle
 import shutil
 import sys
@@ -98,7 +99,20 @@ def empty_weights(folder: Path) -> None:
     save_file({}, folder / "text_encoder/model.safetensors")
 
 
+def piped(folder: Path) -> None:
+    (folder / "tokenizer/tokenizer.json").unlink()
+    os.mkfifo(folder / "tokenizer/tokenizer.json")
+
+
+def endless(folder: Path) -> None:
+    (folder / "text_encoder/model.safetensors").unlink()
+    pickled = b"\x80\x02})" + b"2\x86" * 60 + b"K\x01s."
+    (folder / "text_encoder/pytorch_model.bin").write_bytes(pickled)
+
+
 DAMAGES = {
+    **({"tokenizer: a pipe": piped} if hasattr(os, "mkfifo") else {}),
+    "encoder: endless": endless,
     "index: a number": replaced(INDEX, unet=5),
     "index: text": replaced(INDEX, unet="diffusers"),
     "index: a dict": replaced(INDEX, unet={"a": 1}),

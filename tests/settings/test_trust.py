@@ -485,6 +485,17 @@ def test_a_hard_link_to_a_file_of_the_user_is_refused_and_the_file_stays(
     assert outside.read_text() == "true\n"
 
 
+def test_no_hint_repeats_the_line_in_the_folder_of_a_sweep(tmp_path, type_line):
+    """A user would paste it into a shell."""
+    plan = {"cwd": ".", "flags": [], "threads": None, "jobs": [], "line": ["$(planted)"], "command": "train"}
+    (tmp_path / "sweep").mkdir()
+    (tmp_path / "sweep/jobs.json").write_text(json.dumps(plan))
+    for words in (("train", "resume=sweep"), ("export", "run=sweep"), ("eval", "run=sweep")):
+        result = type_line(*words)
+        assert result.code != 0
+        assert "planted" not in result.out + result.err
+
+
 def test_view_writes_no_report_into_a_folder_with_a_link_out_of_it(tmp_path, type_line):
     (tmp_path / "outside").mkdir()
     (tmp_path / "sweep").mkdir()
