@@ -4,6 +4,7 @@ A model is a folder with a ``model_index.json``, which names a class for each of
 a text encoder, a tokenizer) is loaded separately and when it is needed. Unused parts are never downloaded.
 """
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -167,6 +168,16 @@ class Pretrained:
         key = f"{self.source.key}.variant"
         require(bool(parts), key, expected=f"a variant of {folder}", got=wanted, example=f"{key}=null")
         return wanted if name in parts else None
+
+    def stored(self, name: str) -> int:
+        """Return the size of the weight files of a network in bytes; 0 if they are not on this disk."""
+        folder = Path(self.where) if Path(self.where).is_dir() else self.file.parent
+        for infix in dict.fromkeys((f".{self.source.variant}" if self.source.variant else "", "")):
+            wanted = re.compile(rf"(diffusion_pytorch_)?model{re.escape(infix)}(-\d+-of-\d+)?\.safetensors")
+            files = [file for file in folder.glob(f"{name}/*") if wanted.fullmatch(file.name)]
+            if files:
+                return sum(file.stat().st_size for file in files)
+        return 0
 
     def config(self, name: str) -> dict[str, Any]:
         """Return the configuration of one part, without loading its weights."""

@@ -206,9 +206,9 @@ class LatentPrior(DiffusionPrior):
         """Estimate the memory of training from the configuration of the model alone.
 
         The working memory is what the autoencoder keeps for the backward pass; the denoiser has no gradient
-        and needs less. Renders have ``size`` pixels per side (512 if that is None too) unless the prior
-        resizes them. Raises ``UserError`` in the cases in which :meth:`embed` does, since training calls this
-        first.
+        and needs less. On the CPU it may also be the denoiser's file, while that is converted. Renders have
+        ``size`` pixels per side (512 if that is None too) unless the prior resizes them. Raises ``UserError``
+        in the cases in which :meth:`embed` does, since training calls this first.
         """
         self._require_readable(prompt, negative)
         pixels = self.size or size or 512
@@ -220,11 +220,20 @@ class LatentPrior(DiffusionPrior):
         encoders = [part for part in self.encoders if self.found.has(part)]
         if is_known or is_elsewhere:
             encoders = []
+        texts = {part: self.found.skeleton(part, self.torch_dtype) for part in encoders}
         return MemoryEstimate(
             weights=_weights(vae) + _weights(network),
-            working=numbers * self._vae_dtype.itemsize,
-            texts=sum(_weights(self.found.skeleton(part, self.torch_dtype)) for part in encoders),
+            working=max(numbers * self._vae_dtype.itemsize, self._converted(self.network_part, network)),
+            texts=sum(map(_weights, texts.values()))
+            + max(map(self._converted, texts, texts.values()), default=0),
         )
+
+    def _converted(self, part: str, network: Any) -> int:
+        """Return the bytes of a part's file if the CPU converts its numbers to the dtype of ``network``."""
+        stored, needed = self.found.stored(part), _weights(network)
+        # A file in the same dtype is mapped into memory, and the mapping is the network.
+        is_converted = self.device.type == "cpu" and not 0.9 * needed < stored < 1.1 * needed
+        return stored if is_converted else 0
 
     def lacks(self) -> str | None:
         """Return why the model cannot be used yet: libraries, ``path`` or weights; None if it is ready."""

@@ -237,6 +237,19 @@ def test_the_estimate_counts_weights_exactly_and_grows_with_the_batch(make, tmp_
     assert prior.memory("a corgi", "", 2, None).texts == 0
 
 
+def test_on_the_cpu_the_estimate_counts_files_that_are_converted(make, tmp_path):
+    """While a file in float16 is converted to float32, both are in memory."""
+    half, plain = tmp_path / "half", make()
+    pipeline = diffusers.StableDiffusionPipeline.from_pretrained(plain.path).to(torch.float16)
+    pipeline.save_pretrained(half)
+    converted = make(path=str(half), size=16)
+    file = half / "unet" / "diffusion_pytorch_model.safetensors"
+    assert converted.memory("a corgi", "", 1, None).working == file.stat().st_size
+    assert make(size=16).memory("a corgi", "", 1, None).working < file.stat().st_size
+    texts = [prior.memory("a dog", "", 1, None).texts for prior in (plain, converted)]
+    assert texts[1] == texts[0] + (half / "text_encoder" / "model.safetensors").stat().st_size
+
+
 def test_the_estimate_of_the_autoencoder_is_what_autograd_keeps(make):
     """With the layers of the published models, and fewer channels."""
     config = {"block_out_channels": (32, 64, 128, 128), "layers_per_block": 2}
