@@ -6,7 +6,9 @@
 // block. A barrier that some threads do not reach is reported as a deadlock.
 //
 // The emulator cannot show the order in which a real memory system makes stores visible to other threads, nor
-// the rounding of a real GPU's exponential.
+// the rounding of a real GPU's exponential. Compiled with -fsanitize=thread, each CUDA thread is a thread of
+// ThreadSanitizer, and only __syncthreads, __syncwarp and the end of a launch order memory, so two threads that
+// use a number without a barrier between them are reported however they were scheduled.
 #pragma once
 
 #include <setjmp.h>
@@ -15,6 +17,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <deque>
 #include <memory>
 #include <stdexcept>
 #include <string>
@@ -37,10 +40,60 @@ struct alignas(16) float4 {
 inline float2 make_float2(float x, float y) { return {x, y}; }
 inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
 
+// 1: blocks of one launch are unordered, as on a GPU. 0: they run one after another. All blocks have the same
+// shared memory, so only 0 says something about races in it.
+extern "C" int unordered_blocks;
+
+#if defined(__SANITIZE_THREAD__)
+extern "C" {
+void* __tsan_get_current_fiber();
+void* __tsan_create_fiber(unsigned);
+void __tsan_switch_to_fiber(void*, unsigned);
+void __tsan_acquire(void*);
+void __tsan_release(void*);
+void AnnotateIgnoreReadsBegin(const char*, int);
+void AnnotateIgnoreReadsEnd(const char*, int);
+void AnnotateIgnoreWritesBegin(const char*, int);
+void AnnotateIgnoreWritesEnd(const char*, int);
+}
+#endif
+
 namespace emulator {
 
+// What ThreadSanitizer is told. Without it, these functions do nothing.
+namespace order {
+#if defined(__SANITIZE_THREAD__)
+inline void before(void* point) { __tsan_release(point); }
+inline void after(void* point) { __tsan_acquire(point); }
+inline void* current() { return __tsan_get_current_fiber(); }
+inline void* create() { return __tsan_create_fiber(0); }
+// 1: the switch itself orders nothing.
+inline void switch_to(void* fiber) { __tsan_switch_to_fiber(fiber, 1); }
+// While an object of this class lives, the thread uses the variables of the emulator itself.
+struct Unwatched {
+  Unwatched() { AnnotateIgnoreReadsBegin(__FILE__, __LINE__), AnnotateIgnoreWritesBegin(__FILE__, __LINE__); }
+  ~Unwatched() { AnnotateIgnoreWritesEnd(__FILE__, __LINE__), AnnotateIgnoreReadsEnd(__FILE__, __LINE__); }
+};
+#else
+inline void before(void*) {}
+inline void after(void*) {}
+inline void* current() { return nullptr; }
+inline void* create() { return nullptr; }
+inline void switch_to(void*) {}
+struct Unwatched {
+  Unwatched() {}
+};
+#endif
+}  // namespace order
+
 constexpr int WARP = 32;
+#if defined(__SANITIZE_THREAD__)
+constexpr size_t STACK = 256 << 10;
+#else
 constexpr size_t STACK = 64 << 10;
+#endif
+// Fibers are used again, by every so many blocks. Unordered blocks with the same fibers would be ordered.
+constexpr unsigned SETS = 4;
 
 struct Failure : std::runtime_error {
   using std::runtime_error::runtime_error;
@@ -57,8 +110,9 @@ struct Meeting {
 struct Fiber {
   ucontext_t start;
   jmp_buf place;
+  void* identity = order::create();  // the thread of ThreadSanitizer
   std::unique_ptr<char[]> stack{new char[STACK]};
-  bool has_started = false, has_ended = false;
+  bool has_started = false, has_ended = true;
   const Meeting* waits_at = nullptr;
   unsigned waits_since = 0;
   bool can_run() const { return !has_ended && (!waits_at || waits_at->generation != waits_since); }
@@ -79,20 +133,43 @@ struct Random {
 struct Machine {
   Random random;
   bool is_shuffled = false;
-  std::vector<Fiber> fibers;
+  std::deque<Fiber> sets[SETS];  // a context must not be moved
+  std::deque<Fiber>* fibers = sets;
   std::vector<Meeting> warps;
   Meeting block;
   int running = 0;
   jmp_buf scheduler;
+  ucontext_t outside;  // the scheduler, as ThreadSanitizer follows it
+  void* identity = nullptr;
+  char launched, ended;  // what they order is known by their addresses
   std::string trouble;
   void (*body)(void*) = nullptr;
   void* argument = nullptr;
 };
 inline Machine machine;
+inline Fiber& running_fiber() { return (*machine.fibers)[size_t(machine.running)]; }
 
+#if defined(__SANITIZE_THREAD__)
+// ThreadSanitizer intercepts setjmp, and does not let it leave a stack.
 inline void yield() {
-  if (_setjmp(machine.fibers[size_t(machine.running)].place) == 0) _longjmp(machine.scheduler, 1);
+  order::switch_to(machine.identity);
+  swapcontext(&running_fiber().start, &machine.outside);
 }
+inline void enter(Fiber& fiber) {
+  order::switch_to(fiber.identity);
+  swapcontext(&machine.outside, &fiber.start);
+}
+#else
+inline void yield() {
+  if (_setjmp(running_fiber().place) == 0) _longjmp(machine.scheduler, 1);
+}
+inline void enter(Fiber& fiber) {
+  if (_setjmp(machine.scheduler) != 0) return;
+  if (fiber.has_started) _longjmp(fiber.place, 1);
+  fiber.has_started = true;
+  setcontext(&fiber.start);
+}
+#endif
 
 inline void fail(const std::string& trouble) {
   if (machine.trouble.empty()) machine.trouble = trouble;
@@ -101,7 +178,8 @@ inline void fail(const std::string& trouble) {
 
 // Returns the generation of the meeting. Its values stay valid for one more generation.
 inline unsigned meet(Meeting& meeting, const char* reason, int seat, uint64_t value) {
-  Fiber& self = machine.fibers[size_t(machine.running)];
+  const order::Unwatched unwatched;
+  Fiber& self = running_fiber();
   const unsigned generation = meeting.generation;
   if (meeting.arrived > 0 && std::strcmp(meeting.reason, reason) != 0)
     fail(std::string("divergence: ") + reason + " in one thread, " + meeting.reason + " in another");
@@ -118,37 +196,56 @@ inline unsigned meet(Meeting& meeting, const char* reason, int seat, uint64_t va
   return generation;
 }
 
+// A barrier that orders memory too. No thread is more than one generation behind, so two points are enough.
+inline void synchronize(Meeting& meeting, const char* reason, int seat) {
+  char* const points = reinterpret_cast<char*>(&meeting.values[0][0]);
+  char* const point = points + 8 * (meeting.generation % 2);
+  order::before(point);
+  meet(meeting, reason, seat, 0);
+  order::after(point);
+}
+
 inline void fiber_main() {
-  machine.body(machine.argument);
-  machine.fibers[size_t(machine.running)].has_ended = true;
-  for (;;) yield();
+  for (;;) {
+    order::after(&machine.launched);
+    machine.body(machine.argument);
+    order::before(&machine.ended);
+    const order::Unwatched unwatched;
+    running_fiber().has_ended = true;
+    yield();
+  }
 }
 
 inline void resume(int index) {
-  Fiber& fiber = machine.fibers[size_t(index)];
   machine.running = index;
   threadIdx.x = unsigned(index);
-  if (_setjmp(machine.scheduler) != 0) return;
-  if (fiber.has_started) _longjmp(fiber.place, 1);
-  fiber.has_started = true;
-  setcontext(&fiber.start);
+  enter(running_fiber());
 }
 
-inline void run_block(int threads) {
-  machine.fibers.resize(size_t(threads));
+// The fibers that stand somewhere in a kernel cannot be used again.
+[[noreturn]] inline void give_up(const std::string& trouble) {
+  machine.fibers->clear();
+  throw Failure(trouble);
+}
+
+inline void run_block(int threads, unsigned set) {
+  machine.fibers = &machine.sets[set];
   machine.warps.assign(size_t((threads + WARP - 1) / WARP), Meeting());
   machine.block = Meeting();
   machine.block.members = threads;
   std::vector<int> order;
   for (int i = 0; i < threads; ++i) {
-    Fiber& fiber = machine.fibers[size_t(i)];
-    fiber.has_started = fiber.has_ended = false;
+    if (machine.fibers->size() <= size_t(i)) {
+      Fiber& fiber = machine.fibers->emplace_back();
+      getcontext(&fiber.start);
+      fiber.start.uc_stack.ss_sp = fiber.stack.get();
+      fiber.start.uc_stack.ss_size = STACK;
+      fiber.start.uc_link = nullptr;
+      makecontext(&fiber.start, fiber_main, 0);
+    }
+    Fiber& fiber = (*machine.fibers)[size_t(i)];
+    fiber.has_ended = false;
     fiber.waits_at = nullptr;
-    getcontext(&fiber.start);
-    fiber.start.uc_stack.ss_sp = fiber.stack.get();
-    fiber.start.uc_stack.ss_size = STACK;
-    fiber.start.uc_link = nullptr;
-    makecontext(&fiber.start, fiber_main, 0);
     ++machine.warps[size_t(i / WARP)].members;
     order.push_back(i);
   }
@@ -162,13 +259,13 @@ inline void run_block(int threads) {
       for (size_t i = order.size() - 1; i > 0; --i) std::swap(order[i], order[machine.random() % (i + 1)]);
     bool has_run = false;
     for (const int i : order) {
-      if (i / WARP == stalled || !machine.fibers[size_t(i)].can_run()) continue;
+      if (i / WARP == stalled || !(*machine.fibers)[size_t(i)].can_run()) continue;
       has_run = true;
       resume(i);
-      alive -= machine.fibers[size_t(i)].has_ended;
-      if (!machine.trouble.empty()) throw Failure(machine.trouble);
+      alive -= (*machine.fibers)[size_t(i)].has_ended;
+      if (!machine.trouble.empty()) give_up(machine.trouble);
     }
-    if (!has_run && stalled < 0) throw Failure("deadlock: some threads wait at a barrier that others never reach");
+    if (!has_run && stalled < 0) give_up("deadlock: some threads wait at a barrier that others never reach");
     if (!has_run) stalled = -1;
   }
 }
@@ -180,6 +277,7 @@ void run_grid(void (*kernel)(Parameters...), unsigned blocks, int threads, uint6
               size_t size, std::index_sequence<I...>) {
   static_assert(((sizeof(Parameters) == 8) && ...), "a launch is a list of eight-byte numbers");
   if (size != 8 * sizeof...(Parameters)) throw Failure("a launch with too many or too few arguments");
+  const order::Unwatched unwatched;
   auto call = [&] {
     std::tuple<Parameters...> parameters;
     (std::memcpy(&std::get<I>(parameters), raw + 8 * I, 8), ...);
@@ -191,15 +289,22 @@ void run_grid(void (*kernel)(Parameters...), unsigned blocks, int threads, uint6
   machine.is_shuffled = seed != 0;
   machine.trouble.clear();
   blockDim.x = unsigned(threads), gridDim.x = blocks;
-  std::vector<unsigned> order(blocks);
-  for (unsigned i = 0; i < blocks; ++i) order[i] = i;
+  std::vector<unsigned> blocks_in_order(blocks);
+  for (unsigned i = 0; i < blocks; ++i) blocks_in_order[i] = i;
   if (machine.is_shuffled)
-    for (unsigned i = blocks; i > 1; --i) std::swap(order[i - 1], order[machine.random() % i]);
-  for (const unsigned block : order) {
+    for (unsigned i = blocks; i > 1; --i)
+      std::swap(blocks_in_order[i - 1], blocks_in_order[machine.random() % i]);
+  machine.identity = order::current();
+  order::before(&machine.launched);
+  for (const unsigned block : blocks_in_order) {
     blockIdx.x = block;
     std::memset(__start_emulated_shared, 0xff, size_t(__stop_emulated_shared - __start_emulated_shared));
-    run_block(threads);
+    run_block(threads, block % SETS);
+    if (unordered_blocks) continue;
+    order::after(&machine.ended);
+    order::before(&machine.launched);
   }
+  order::after(&machine.ended);
 }
 
 template <class... Parameters>
@@ -276,8 +381,8 @@ template <class T>
 T keep_in_register(T x) {
   return x;
 }
-inline void __syncthreads() { emulator::meet(emulator::machine.block, "__syncthreads", 0, 0); }
-inline void __syncwarp() { emulator::meet(emulator::warp(), "__syncwarp", emulator::lane(), 0); }
+inline void __syncthreads() { emulator::synchronize(emulator::machine.block, "__syncthreads", 0); }
+inline void __syncwarp() { emulator::synchronize(emulator::warp(), "__syncwarp", emulator::lane()); }
 inline unsigned __ballot_sync(unsigned mask, bool vote) {
   return emulator::ballot("__ballot_sync", mask, vote);
 }
@@ -290,8 +395,4 @@ template <class T>
 T __shfl_xor_sync(unsigned mask, T value, int reach) {
   return emulator::shuffle("__shfl_xor_sync", mask, value, emulator::lane() ^ reach);
 }
-inline unsigned atomicAdd(unsigned* to, unsigned value) {
-  const unsigned before = *to;
-  *to += value;
-  return before;
-}
+inline unsigned atomicAdd(unsigned* to, unsigned value) { return __atomic_fetch_add(to, value, __ATOMIC_RELAXED); }

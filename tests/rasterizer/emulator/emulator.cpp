@@ -6,6 +6,7 @@
 // The number of the planted mistake that is switched on. Only altered copies of the kernels read it.
 extern "C" {
 int active_mutant = 0;
+int unordered_blocks = 0;
 }
 
 // The emulator must come first, because it defines __global__ and the like for the kernels.

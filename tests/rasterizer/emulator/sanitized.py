@@ -1,7 +1,8 @@
 """Run sanitized kernels at small and at odd sizes, and then once with each planted mistake.
 
 python sanitized.py LIBRARY NUMBER_OF_MISTAKES, started by test_cuda_sanitizer.py. Writes a line to stderr
-before each planted mistake, so that the findings of the sanitizers can be distinguished.
+before each planted mistake, so that the findings of the sanitizers can be distinguished. With the word
+"races" instead of the number, it runs what can differ between threads.
 """
 
 import ctypes
@@ -45,6 +46,16 @@ def run_everything(emulator: Emulator) -> None:
         render(emulator, 3, 0, 1.5, (1, 75, 70), absgrad=absgrad)
 
 
+def run_races(emulator: Emulator) -> None:
+    for cuda_sort.FEW_NUMBERS, cuda_sort.FEW_COUNTS, cuda_sort.MOST_BLOCKS in LAYOUTS[:2]:
+        with emulator.on(CPU) as launch:
+            scan_tensor(launch, torch.ones(cuda_sort.SCAN_CHUNK + 1, dtype=torch.int32))
+            sort_tensor(launch, torch.arange(cuda_sort.SCAN_CHUNK + 1, 0, -1, dtype=torch.int32), 8)
+    for absgrad in (False, True):
+        cuda.FEW_TILES = 10**9 if absgrad else 0
+        render(emulator, 33, 0, -1.0, (2, 9, 17), absgrad=absgrad)
+
+
 def render(
     emulator: Emulator,
     n: int,
@@ -59,15 +70,35 @@ def render(
     render_and_differentiate(partial(cuda.rasterize, emulator, capacity=capacity), *scene, absgrad=absgrad)
 
 
-def main(library: str, mistakes: int) -> None:
-    emulator = Emulator(ctypes.CDLL(library))
+def sanitize(emulator: Emulator, mistakes: int) -> None:
     run_everything(emulator)
-    print("all done", flush=True)
     for mutant in range(1, mistakes + 1):
         print(f"planted {mutant}", file=sys.stderr, flush=True)
         emulator.activate(mutant)
         render(emulator, 10, 0, -1.0, (1, 9, 17), absgrad=False)
 
 
+def look_for_races(emulator: Emulator) -> None:
+    """Run with ordered blocks and a race between lanes, then with unordered ones and a race between blocks.
+
+    ThreadSanitizer reports the same two places only once, and with unordered blocks it also reports all of
+    the shared memory, so the order matters.
+    """
+    run_races(emulator)
+    print("planted 1", file=sys.stderr, flush=True)
+    emulator.activate(1)
+    render(emulator, 10, 0, -1.0, (1, 9, 17), absgrad=False)
+    print("unordered", file=sys.stderr, flush=True)
+    emulator.activate(0)
+    ctypes.c_int.in_dll(emulator.library, "unordered_blocks").value = 1
+    run_races(emulator)
+    print("planted 2", file=sys.stderr, flush=True)
+    emulator.activate(2)
+    with emulator.on(CPU) as launch:
+        scan_tensor(launch, torch.ones(cuda_sort.SCAN_CHUNK + 1, dtype=torch.int32))
+
+
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]))
+    kernels, count = Emulator(ctypes.CDLL(sys.argv[1])), sys.argv[2]
+    look_for_races(kernels) if count == "races" else sanitize(kernels, int(count))
+    print("all done", flush=True)
