@@ -81,9 +81,12 @@ class Payload:
         return (open, (str(self.marker), "w"))
 
 
-def pickled(folder: Path) -> None:
-    (folder / "text_encoder/model.safetensors").unlink()
-    (folder / "text_encoder/pytorch_model.bin").write_bytes(pickle.dumps(Payload(folder / "marker")))
+def pickled(weights: str, other: str):
+    def change(folder: Path) -> None:
+        (folder / weights).unlink()
+        (folder / weights).with_name(other).write_bytes(pickle.dumps(Payload(folder / "marker")))
+
+    return change
 
 
 def removed(name: str):
@@ -137,7 +140,8 @@ DAMAGES = {
     "encoder: no vocabulary": replaced(ENCODER, vocab_size=None),
     "encoder: kernels": replaced(ENCODER, attn_implementation="evil/kernel"),
     "encoder: deep": holding(ENCODER, DEEP),
-    "encoder: a pickle": pickled,
+    "encoder: a pickle": pickled("text_encoder/model.safetensors", "pytorch_model.bin"),
+    "network: a pickle": pickled(WEIGHTS, "diffusion_pytorch_model.bin"),
     "encoder: empty weights": empty_weights,
     "encoder: cut": cut("text_encoder/model.safetensors"),
     "autoencoder: no scale": replaced("vae/config.json", scaling_factor="x"),
