@@ -1,10 +1,12 @@
 """MeshExporter: the surface of the asset as triangles, for programs that do not read Gaussians."""
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
 from cadam3d.core.checks import require_choice, require_whole, unless_none
+from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.mesh.surface import SurfaceSettings
@@ -74,6 +76,9 @@ class MeshExporter(SurfaceSettings, Exporter):
         Raises ``UserError`` if the asset has no surface or if a file cannot be written.
         """
         surface, painter = self.surface(gaussians)
+        if surface.is_smoothed:
+            lost = f"smoothing removes {surface.roughness:.0%} of the area of its surface"
+            say(f"Note: {self.node}: the asset is fuzzy, and {lost}. The mesh is smooth.", logging.WARNING)
         texture = None if self.texture is None else paint(surface, painter.colors, self.texture)
         path = folder / self.file_name
         if self.format == "obj":

@@ -65,6 +65,18 @@ def test_every_format_is_one_upright_watertight_file(tmp_path, format):
         assert top[0] > 2 * top[2]  # red is above, so +y is up
 
 
+def test_a_fuzzy_asset_is_smoothed_with_a_note_and_a_clean_one_without(tmp_path, capsys):
+    export(tmp_path)
+    assert capsys.readouterr().err == ""
+    ball = two_coloured_ball()
+    draw = torch.Generator().manual_seed(0)
+    fuzzy = ball.index(torch.arange(800).repeat(8))
+    fuzzy.means = fuzzy.means + 0.05 * torch.randn(fuzzy.means.shape, generator=draw)
+    fuzzy.log_scales = torch.full_like(fuzzy.log_scales, math.log(0.012))
+    MeshExporter(**SETTINGS | {"resolution": 128}).export(fuzzy, never_renders, tmp_path)
+    assert "exporter.mesh: the asset is fuzzy, and smoothing removes " in capsys.readouterr().err
+
+
 def test_the_same_asset_gives_the_same_bytes(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()

@@ -119,6 +119,26 @@ def test_specks_are_removed_however_far_away_they_are():
     assert len(with_speck.faces) > 0.4 * len(without.faces)  # the resolution is that of the object
 
 
+def test_a_fuzzy_ball_is_smoothed_to_a_ball_and_a_solid_ball_is_not():
+    draw = torch.Generator().manual_seed(0)
+    near = ball(0.5, 6000).means * (1 + 0.08 * torch.randn(6000, 1, generator=draw))
+    fuzzy = surface(at(near, scale=0.012), resolution=128)
+    assert fuzzy.is_smoothed
+    assert fuzzy.roughness > 0.25
+    assert is_watertight(fuzzy.faces)
+    assert facts(fuzzy.vertices, fuzzy.faces).area < 2 * 4 * math.pi * 0.5**2
+    solid = surface(ball(0.5), resolution=128)
+    assert not solid.is_smoothed
+    assert solid.roughness < 0.05
+
+
+@pytest.mark.parametrize("resolution", [48, 128])
+def test_a_thin_wire_is_not_smoothed_away(resolution):
+    angle = torch.arange(1000) / 1000 * 2 * math.pi
+    ring = at(torch.stack([angle.cos(), angle.sin(), 0 * angle], 1) * 0.8, scale=0.006)
+    assert not surface(ring, resolution=resolution).is_smoothed
+
+
 def test_two_objects_stay_two_parts():
     right = ball(0.2)
     right.means = right.means + torch.tensor([0.0, 0.8, 0.0])
