@@ -23,7 +23,7 @@ ADDS = ("APPEND", "APPENDS", "SETITEM", "SETITEMS", "ADDITEMS", "BUILD")
 
 @dataclass(frozen=True)
 class _Built:
-    """What is known of an object on the stack of a pickle."""
+    """Describes an object on the stack of a pickle."""
 
     depth: int = 0
     size: int = 1  # objects in it, as often as they appear
