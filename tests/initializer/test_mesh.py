@@ -283,3 +283,11 @@ def test_a_named_pipe_in_place_of_a_file_does_not_hang(tmp_path, place):
         path.write_text(json.dumps(document))
         with pytest.raises(UserError, match="cannot be read"):
             build(path)
+
+
+def test_a_mesh_reads_no_file_outside_of_its_folder(tmp_path, capsys):
+    (tmp_path / "inside").mkdir()
+    Image.new("RGB", (4, 4), (0, 0, 255)).save(tmp_path / "skin.png")
+    made = build(textured_quad(tmp_path / "inside", map_kd="map_Kd ../skin.png"), count=20)
+    torch.testing.assert_close(rgb(made), torch.tensor([1.0, 0.0, 0.0]).expand(20, 3), atol=1e-5, rtol=0)
+    assert "no texture that can be read" in capsys.readouterr().err

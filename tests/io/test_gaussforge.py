@@ -1,6 +1,7 @@
 """SOG, ksplat and SPZ version 4 through gaussforge: the same object, the expected layout, clear refusals."""
 
 import signal
+import sys
 import time
 
 import numpy as np
@@ -112,3 +113,14 @@ def test_a_crash_of_gaussforge_is_one_message(tmp_path, monkeypatch):
     (tmp_path / "a.sog").write_bytes(b"PK\3\4")
     with pytest.raises(UserError, match=r"a\.sog: gaussforge cannot read it \(it ended with -?\d+\)"):
         read_forged(tmp_path / "a.sog", "sog")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits are promised on Linux")
+def test_the_memory_of_reading_is_limited(tmp_path, monkeypatch):
+    write_sog(tmp_path / "a.sog", random_gaussians(30), up="-y")
+    assert len(read_forged(tmp_path / "a.sog", "sog")) == 30
+    monkeypatch.setattr(gaussforge, "SPARE_BYTES", 1 << 20)
+    monkeypatch.setattr(gaussforge, "MOST_EXPANSION", 1)
+    with pytest.raises(UserError, match=r"a\.sog: gaussforge cannot read it") as caught:
+        read_forged(tmp_path / "a.sog", "sog")
+    assert "\n" not in str(caught.value)

@@ -10,7 +10,10 @@ from programs.files import (
     assert_wrong_axes_fail,
     in_browser,
 )
-from programs.render_elsewhere import Browser, RefusedError, SplatTransform
+from programs.render_elsewhere import Browser, RefusedError, SplatTransform, ours, psnr
+from programs.snowman import snowman_and_pine
+
+from cadam3d.io.glb import write_glb
 
 pytestmark = [pytest.mark.oracle, pytest.mark.slow]
 
@@ -72,6 +75,15 @@ def test_files_with_the_wrong_axes_are_upside_down(draw, case, tmp_path):
 def test_other_files_look_like_the_ply_in_three_js(draw, of_ply, case, tmp_path):
     path = case.write(tmp_path, case.upright)
     assert_equal(draw(path), of_ply[case.degree], AGAINST_PLY_DB[str(case)], path)
+
+
+def test_linear_colours_are_right_in_three_js_without_a_setting(browser, tmp_path):
+    gaussians = snowman_and_pine(3)
+    for colors, floor_db, top_db in (("linear", 23, 40), ("display", 10, 20)):
+        write_glb(tmp_path / f"{colors}.glb", gaussians, up="+y", colors=colors)
+        picture = browser.picture("three.html", tmp_path / f"{colors}.glb", VIEW)
+        assert_equal(picture, ours(gaussians, VIEW), floor_db, tmp_path / f"{colors}.glb")
+        assert psnr(picture, ours(gaussians, VIEW)) < top_db
 
 
 @pytest.mark.parametrize("program", ["Spark", "SuperSplat", "three.js"])
