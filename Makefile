@@ -13,7 +13,7 @@ PYTHON ?= $(firstword $(foreach name,$(CANDIDATES),$(shell $(name) -c '$(SUPPORT
 JOBS ?= auto
 BASE ?= main
 BIN := .venv/bin
-INSTALL := $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable
+INSTALL := $(BIN)/python -m pip install --constraint constraints.txt --editable
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test check gpu docs clean
@@ -55,8 +55,11 @@ clean:
 	rm -rf .venv build dist site .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# The installs are editable: a changed source needs no new install; changed dependencies do.
+# The installs are editable: a changed source needs no new install; changed dependencies do. The largest download is
+# torch with 2 to 3 GB on Linux, so pip shows its progress.
 .venv/.installed: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "Installing cadam3d, torch and diffusers into .venv. With torch's CUDA libraries, which Linux gets by default, this is a"
+	@echo "download of 2 to 3 GB; with torch's build for the CPU, .venv takes 1.7 GB. It takes some minutes, and pip shows its progress."
 	$(INSTALL) ".[diffusers]"
 	@touch $@
 
@@ -64,9 +67,8 @@ clean:
 	$(INSTALL) ".[dev]"
 	@touch $@ .venv/.installed .venv/.installed-docs
 
-# The largest download is torch with 2 to 3 GB, so pip shows its progress.
 .venv/.installed-gpu: pyproject.toml constraints.txt | $(BIN)/python
-	$(BIN)/python -m pip install --constraint constraints.txt --editable ".[gpu]"
+	$(INSTALL) ".[gpu]"
 	@touch $@ .venv/.installed
 
 .venv/.installed-docs: pyproject.toml constraints.txt | $(BIN)/python

@@ -176,6 +176,19 @@ def test_the_projects_own_commands_use_the_tested_versions():
     assert "--constraint constraints.txt" in done.stdout
 
 
+def test_make_demo_says_what_it_installs_and_shows_the_progress():
+    done = subprocess.run(
+        ["make", "-n", "-W", "pyproject.toml", "demo"],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    said, _, rest = done.stdout.partition("pip install")
+    assert re.search(r"echo .*GB.*minutes", said, re.DOTALL)
+    assert "--quiet" not in rest
+
+
 def test_the_ci_runs_make_test_and_nothing_else():
     script = REPOSITORY / ".ci" / "run"
     assert os.access(script, os.X_OK)
