@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from cadam3d import optimizer as optimizer_module
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import FIELDS, Gaussians
@@ -39,6 +40,11 @@ def push(optimizer: GaussianOptimizer, seed: int) -> None:
         tensor.grad = getattr(noise, name)
 
 
+def transposed(tensor: torch.Tensor) -> torch.Tensor:
+    """Return the same numbers with another order in memory."""
+    return tensor.transpose(0, -1).contiguous().transpose(0, -1)
+
+
 def train(optimizer: GaussianOptimizer, steps: range) -> None:
     for step in steps:
         push(optimizer, seed=100 + step)
@@ -69,6 +75,30 @@ def test_every_tensor_moves_as_under_the_adam_of_torch():
         theirs.step()
     for name, part in parts_of(ours.gaussians.detach()).items():
         torch.testing.assert_close(part, parts[name], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+@pytest.mark.parametrize("k", [1, 16])
+def test_one_kernel_for_each_tensor_moves_as_the_separate_operations(k, device, monkeypatch):
+    if device == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no GPU")
+    both = []
+    for fused in ((), (device,)):
+        monkeypatch.setattr(optimizer_module, "FUSED", fused)
+        start = gaussians(200, k=k).to(torch.device(device))
+        optimizer = settings(clip_norm=3.0).start(start)
+        for step in range(20):
+            noise = gaussians(200, seed=step, k=k).to(start.device)
+            for name, tensor in optimizer.gaussians.tensors().items():
+                # Also gradients that are not contiguous, and a missing one.
+                tensor.grad = None if (name, step) == ("quats", 5) else transposed(getattr(noise, name))
+            optimizer.step(step)
+        both.append(optimizer)
+    for name in FIELDS:
+        one, other = (getattr(each.gaussians.detach(), name) for each in both)
+        torch.testing.assert_close(one, other, rtol=0, atol=2e-6)
+    for name, moment in as_named(both[0].state_dict()).items():
+        torch.testing.assert_close(as_named(both[1].state_dict())[name], moment, rtol=1e-5, atol=1e-9)
 
 
 def test_a_missing_gradient_is_the_gradient_zero():
