@@ -20,10 +20,10 @@ from cadam3d.core.checks import require_range
 from cadam3d.core.device import upload_together
 from cadam3d.core.edit import RowState
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.ghosts import ghosts
 from cadam3d.core.memory import is_out_of_memory
 from cadam3d.core.rendering import RenderFn, RenderOutput
 from cadam3d.densifier.base import Densifier, GradientSignal
-from cadam3d.densifier.ghosts import ghosts
 from cadam3d.densifier.refine import Refine, RefinePlan
 from cadam3d.exposure import Exposure
 from cadam3d.guidance.base import Guidance

@@ -60,7 +60,7 @@ void AnnotateIgnoreWritesEnd(const char*, int);
 
 namespace emulator {
 
-// What ThreadSanitizer is told. Without it, these functions do nothing.
+// These functions tell ThreadSanitizer what is ordered. Otherwise they do nothing.
 namespace order {
 #if defined(__SANITIZE_THREAD__)
 inline void before(void* point) { __tsan_release(point); }

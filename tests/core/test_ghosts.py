@@ -3,7 +3,7 @@
 import torch
 
 from cadam3d.core.gaussians import Gaussians, concatenate
-from cadam3d.densifier.ghosts import ghosts
+from cadam3d.core.ghosts import ghosts
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
 RENDER = ReferenceRasterizer().render
