@@ -20,7 +20,6 @@ from cadam3d.settings.options import (
     unknown_option,
     unknown_setting,
 )
-from cadam3d.settings.output import GROUP, writing
 
 SWEEP_COMPLAINT = r"(?:Ambiguous value for argument|Sweep parameters) '(.+?)'(?: requires|$)"
 # The choice of an option or of a list of options.
@@ -75,11 +74,16 @@ def _unknown_option(error: MissingConfigException, command: str) -> UserError:
         package = f"hydra-{option.partition('_')[0]}-launcher"
         return UserError(f"launcher: {option} is not installed. Try: pip install {package}")
     if group and (options := sorted(error.options or option_names(group))):
-        words = writing(option) if group == GROUP else ""
-        if words:
+        if group == "exporter" and (words := _writing(option)):
             return fail(group, expected=f"one of {'|'.join(options)}", got=option, example=words)
         return unknown_option(group, option, options, command)
     return UserError(f"{option}: no such configuration. Try: cadam3d {command} --help")
+
+
+def _writing(kind: str) -> str:
+    from cadam3d.settings.output import writing  # slow to import
+
+    return writing(kind)
 
 
 def _no_name(reason: str, command: str, words: Sequence[str]) -> UserError:
