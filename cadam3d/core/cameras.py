@@ -75,17 +75,6 @@ class Cameras:
             drawn=None,
         )
 
-    def rays(self) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "v h w 3"]]:
-        """Return world-space ray origins, and unit directions through every pixel centre."""
-        kwargs = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}
-        y, x = torch.meshgrid(
-            torch.arange(self.height, **kwargs) + 0.5, torch.arange(self.width, **kwargs) + 0.5, indexing="ij"
-        )
-        pixels = torch.stack([x, y, torch.ones_like(x)], dim=-1)
-        to_world = self.world_to_camera[:, :3, :3].transpose(1, 2) @ torch.linalg.inv(self.intrinsics)
-        directions = torch.einsum("vij,hwj->vhwi", to_world, pixels)
-        return self.positions, torch.nn.functional.normalize(directions, dim=-1)
-
 
 def vertical_turn(turn_deg: float, like: Tensor) -> Float[Tensor, "4 4"]:
     """Return the matrix that turns points around the world's +z, counterclockwise seen from above.

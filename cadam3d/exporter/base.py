@@ -1,7 +1,7 @@
 """Exporter: writes an asset, or pictures of it, into a folder."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -11,6 +11,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderFn, Subject
 from cadam3d.io.frames import UPS
+from cadam3d.io.gaussforge import require_gaussforge
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,11 +113,16 @@ class AssetExporter(Exporter):
 
     # Node of the configuration, such as "exporter.spz", with which error messages begin.
     node: ClassVar[str]
+    # Writes the file, given its path, the Gaussians and ``up``; a format with settings overrides ``write``.
+    writer: ClassVar[Callable[..., None]]
+    uses_gaussforge: ClassVar[bool] = False
 
     up: str  # up axis of the file, one of UPS
 
     def __post_init__(self) -> None:
         require_choice(f"{self.node}.up", self.up, UPS)
+        if self.uses_gaussforge:
+            require_gaussforge(self.node)
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
         """Write the file and return its path."""
@@ -124,12 +130,12 @@ class AssetExporter(Exporter):
         self.write(path, gaussians)
         return [path]
 
-    @abstractmethod
     def write(self, path: Path, gaussians: Gaussians) -> None:
         """Write ``gaussians`` (in world axes) into ``path``, atomically.
 
-        Raises ``UserError`` if the file cannot be written.
+        Raises ``UserError`` if the file cannot be written, or if the format cannot hold its numbers.
         """
+        type(self).writer(path, gaussians, up=self.up)
 
     def contents(self, path: Path, gaussians: Gaussians) -> Contents:
         """Return the number of Gaussians, their SH degree in the file, and its axes."""

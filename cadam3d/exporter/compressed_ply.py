@@ -1,10 +1,8 @@
 """CompressedPlyExporter: the asset as a compressed PLY of SuperSplat."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
-from cadam3d.core.gaussians import Gaussians
 from cadam3d.exporter.base import AssetExporter
 from cadam3d.io.compressed_ply import write_compressed_ply
 
@@ -15,12 +13,6 @@ class CompressedPlyExporter(AssetExporter):
 
     node: ClassVar = "exporter.compressed_ply"
     files: ClassVar = ("asset.compressed.ply",)
+    writer: ClassVar = write_compressed_ply
     loss: ClassVar = "rounds positions, scales and rotations to 10 or 11 bits, colours and opacities to 8"
     sh_loss: ClassVar = "view-dependent colours to 8"
-
-    def write(self, path: Path, gaussians: Gaussians) -> None:
-        """Write the file atomically.
-
-        Raises ``UserError`` if it cannot be written, or if a number is NaN or infinite.
-        """
-        write_compressed_ply(path, gaussians, up=self.up)

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from cadam3d.core.checks import require_choice
 from cadam3d.core.pictures import PictureSettings
 from cadam3d.core.rendering import Subject
 from cadam3d.exporter.pictures import PictureExporter, captions_of, paper_of
@@ -37,7 +36,6 @@ class PreviewExporter(PictureSettings, PictureExporter):
         super().__post_init__()
         self.require_angles("elevations_deg", self.elevations_deg, limit=90)
         self.require_views(self.views)
-        require_choice("exporter.preview.labels", self.labels, (True, False))
 
     def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
         """Render row by row and write the sheet."""

@@ -1,10 +1,8 @@
 """SplatExporter: the asset as a .splat file, for simple viewers on the web."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
-from cadam3d.core.gaussians import Gaussians
 from cadam3d.exporter.base import AssetExporter
 from cadam3d.io.splat import write_splat
 
@@ -15,9 +13,6 @@ class SplatExporter(AssetExporter):
 
     node: ClassVar = "exporter.splat"
     files: ClassVar = ("asset.splat",)
+    writer: ClassVar = write_splat
     max_degree: ClassVar = 0
     loss: ClassVar = "rounds colours, opacities and rotations to 8 bits"
-
-    def write(self, path: Path, gaussians: Gaussians) -> None:
-        """Write the file atomically. Raises ``UserError`` if it cannot be written."""
-        write_splat(path, gaussians, up=self.up)

@@ -111,7 +111,6 @@ class GCS(WindowedGuidance):
             is_any, "guidance.w_gc", expected="a number > 0, since w_cc and w_cp are 0 as well", got=self.w_gc
         )
         require_scheduled("guidance.delta", self.delta, above=GAP, high=0.5)
-        require_choice("guidance.fixed_noise", self.fixed_noise, (True, False))
         require_range("guidance.noise_offset", self.noise_offset, low=0)
         require_choice("guidance.reduction", self.reduction, list(DIVISORS))
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_choice
+from cadam3d.core.checks import require
 from cadam3d.core.schedule import FAR_STEP, Schedule, as_schedule, require_scheduled
 from cadam3d.guidance.base import Guidance
 
@@ -23,7 +23,6 @@ class WindowedGuidance(Guidance):
     shared_t: bool
 
     def __post_init__(self) -> None:
-        require_choice("guidance.shared_t", self.shared_t, (True, False))
         require_scheduled("guidance.t_min", self.t_min)
         require_scheduled("guidance.t_max", self.t_max)
         # At the steps in between, the two may cross. These are checked when training reaches them.

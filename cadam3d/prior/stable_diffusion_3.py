@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (the usual name)
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import require, require_choice
+from cadam3d.core.checks import require
 from cadam3d.io.pretrained import Pretrained
 from cadam3d.prior.latent import LatentPrior, number_in
 from cadam3d.prior.path import Latents, NoisePath, PerView, Prediction, RectifiedFlow
@@ -36,10 +36,6 @@ class StableDiffusion3(LatentPrior):
     network_part: ClassVar = "transformer"
     half: ClassVar = "bfloat16"
     upcasts: ClassVar = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_choice("prior.t5", self.t5, (True, False))
 
     @property
     def encoders(self) -> tuple[str, ...]:

@@ -62,11 +62,6 @@ def test_cameras_look_at_the_origin_and_are_upright():
         assert ((pixels[:, 1] < 19.9) == is_above).all()
 
 
-def test_images_are_square_and_of_the_requested_size():
-    cameras = sample(2, size=33)
-    assert (cameras.height, cameras.width, len(cameras)) == (33, 33, 2)
-
-
 @pytest.mark.parametrize(("law", "power"), [("uniform", 0), ("sphere", 1)])
 def test_the_elevation_law_sets_how_often_the_top_is_seen(law, power):
     elevation = sample(40_000, elevation_deg=[0.0, 90.0], elevation_law=law).elevation_deg

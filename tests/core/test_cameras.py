@@ -81,16 +81,6 @@ def test_a_pinhole_spans_its_vertical_field_of_view():
     assert intrinsics.tolist() == [[pytest.approx(50), 0, 20], [0, pytest.approx(50), 50], [0, 0, 1]]
 
 
-def test_rays_leave_the_camera_through_pixel_centres():
-    cameras = one(height=3, width=5)
-    origins, directions = cameras.rays()
-    torch.testing.assert_close(origins, cameras.positions)
-    torch.testing.assert_close(directions.norm(dim=-1), torch.ones(1, 3, 5).double())
-    points = (origins[:, None, None] + 1.7 * directions).reshape(-1, 3)
-    x, y = torch.meshgrid(torch.arange(5) + 0.5, torch.arange(3) + 0.5, indexing="xy")
-    torch.testing.assert_close(to_pixels(cameras, points), torch.stack([x, y], -1).reshape(-1, 2).double())
-
-
 def test_resizing_scales_pixel_coordinates_with_the_image():
     cameras, points = (
         one(height=6, width=8),

@@ -58,14 +58,6 @@ def test_a_zero_quaternion_is_the_identity():
     assert torch.equal(gaussians.rotations[0], torch.eye(3))
 
 
-def test_rotations_are_rotations():
-    rotations = make(50).rotations
-    torch.testing.assert_close(
-        rotations @ rotations.transpose(1, 2), torch.eye(3).expand(50, 3, 3), atol=1e-5, rtol=0
-    )
-    torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(50))
-
-
 @pytest.mark.parametrize(
     "rows",
     [torch.tensor([3, 0, 3]), torch.tensor([True, False, True, True]), slice(1, 3)],

@@ -51,8 +51,7 @@ def test_names_sort_in_the_order_of_the_views(tmp_path):
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        *(("views", 0), ("elevations_deg", [100.0]), ("distance", 0.0), ("size", 0), ("background", [2.0])),
-        *(("background", "clear"), ("kinds", ["rgb", "x"])),
+        *(("views", 0), ("elevations_deg", [100.0]), ("background", "clear"), ("kinds", ["rgb", "x"])),
     ],
 )
 def test_values_out_of_range_are_refused(key, value):

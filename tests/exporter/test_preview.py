@@ -63,10 +63,6 @@ def test_labels_are_written_on_request(tmp_path):
         ("views", 0),
         ("elevations_deg", []),
         ("elevations_deg", [0.0, 100.0]),
-        ("distance", -1.0),
-        ("fov_y_deg", 0.0),
-        ("size", 0),
-        ("background", []),
     ],
 )
 def test_wrong_values_name_their_key(key, value):

@@ -147,11 +147,6 @@ def test_fitted_points_are_centred_with_the_farthest_at_the_radius():
     torch.testing.assert_close(placed.amin(dim=0), -placed.amax(dim=0), atol=1e-5, rtol=0)
 
 
-def test_without_a_radius_points_do_not_move():
-    center, factor = fit(cloud(5), None)
-    assert torch.equal((cloud(5) - center) * factor, cloud(5))
-
-
 def test_a_single_point_is_moved_to_the_origin():
     center, factor = fit(cloud(1), 0.5)
     assert ((cloud(1) - center) * factor).tolist() == [[0, 0, 0]]

@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from cadam3d.rasterizer.reference import ReferenceRasterizer
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))  # as Python does for a script
 
 import bench_rasterizer
-from rasterizer_bench import check, timing
+from rasterizer_bench import check
 from rasterizer_bench.scenes import make_scene, make_shell
 from rasterizer_bench.stages import CPU_STAGES, REST
 
@@ -132,36 +132,3 @@ def test_both_ways_to_render_must_give_the_same_bits():
     scene = make_scene(make_shell(30, 0, CPU), 16, 1)
     assert not check.changes(ReferenceRasterizer(), scene)
     assert check.changes(Ahead(), scene)
-
-
-def test_a_step_without_enough_memory_is_repeated():
-    @dataclass(frozen=True)
-    class TooSmall(ReferenceRasterizer):
-        def render_ahead(self, gaussians, *rest):
-            output = self.render(gaussians.map(lambda tensor: tensor * 0), *rest)
-            return replace(output, overflowed=torch.tensor(True))
-
-    scene = make_scene(make_shell(30, 0, CPU), 16, 1)
-    scene.step(TooSmall())
-    got = check.gradients_of(scene)
-    scene.zero_grad()
-    scene.backward(scene.render(ReferenceRasterizer()))
-    for name, gradient in check.gradients_of(scene).items():
-        assert torch.equal(got[name], gradient), name
-
-
-# -------------------------------------------------------------------------- timing
-
-
-@dataclass(frozen=True)
-class Greedy(Rasterizer):
-    def render(self, gaussians, cameras, background, absgrad=False):
-        raise torch.OutOfMemoryError
-
-
-def test_a_backend_that_runs_out_of_memory_does_not_stop_the_others():
-    backends = {"auto": Greedy(), "reference": ReferenceRasterizer()}
-    assert run([*TINY, "--no-check"], backends) == 0
-    timings = timing.take_turns(backends, make_scene(make_shell(20, 0, CPU), 9, 1), 1)
-    assert timings["auto"] is None
-    assert timings["reference"] is not None
