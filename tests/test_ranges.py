@@ -19,10 +19,9 @@ BEYOND = {
     "camera=multiview": "size=0 elevation_deg=[30,0] elevation_law=gaussian relative_distance=[0.1,1] "
     "relative_distance=[1] fov_y_deg=[0,60]",
     "camera=sphere": "size=0 distance=[3,2] fov_y_deg=[45,175]",
-    # The last of the factors leads away from its end.
     "camera=progressive": "size=0 distance.start=[0.5,3] distance.end=[9,8] fov_y_deg.end=[0,30] "
     "azimuth_deg.start=[0] elevation_deg.end=[-100,0] fov_y_deg.factor=[0,1] fov_y_deg.factor=[0.75] "
-    "fov_y_deg.factor=[1.5,1] begin=-1 every=0 gamma=0 position_jitter=-0.1 target_jitter=-0.1 up_jitter=2",
+    "begin=-1 every=0 gamma=0 position_jitter=-0.1 target_jitter=-0.1 up_jitter=2",
     "guidance=sds": GUIDED,
     "guidance=vfds": GUIDED,
     "guidance=csd": "weight=0 reduction=max t_max=1.1 weighting=sds clip=0 empty_share=-0.1 empty_share=1.1",

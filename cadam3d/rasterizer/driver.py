@@ -22,6 +22,9 @@ from cadam3d.rasterizer.nvrtc import build
 Launch = Callable[..., None]
 LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 OUT_OF_MEMORY = 2  # CUDA_ERROR_OUT_OF_MEMORY
+# After a kernel has failed, every call of the process returns one of these, whoever launched the kernel: an
+# illegal address, a timeout, an assertion, and the errors of the hardware.
+STICKY = (700, 702, 710, *range(714, 720))
 # Labels in the list of extra options of a launch: CU_LAUNCH_PARAM_END and so on.
 END, BUFFER_POINTER, BUFFER_SIZE = 0, 1, 2
 # By number of arguments: the function that writes them into a buffer, as whole numbers of eight bytes.
@@ -127,6 +130,11 @@ class Module:
         reason = (message.value or b"error").decode()
         if status == OUT_OF_MEMORY:
             raise MemoryError(f"rasterizer=cuda: {name}: {reason}")
+        if status in STICKY:
+            raise UserError(
+                f"CUDA: some kernel of this process failed before {name}: {reason} ({status}). "
+                "Try: CUDA_LAUNCH_BLOCKING=1 in the environment, which shows where"
+            )
         raise UserError(f"rasterizer=cuda: {name}: {reason} ({status}). Try: rasterizer=reference")
 
     def _call(self, name: str, *arguments: object) -> None:

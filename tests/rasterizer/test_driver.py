@@ -87,6 +87,12 @@ def test_errors_of_the_driver_are_quoted(stub):
         Module(stub, 0, b"foreign")
 
 
+def test_a_kernel_that_failed_before_is_not_called_ours(stub):
+    with pytest.raises(UserError, match=r"^CUDA: some kernel of this process failed before") as caught:
+        Module(stub, 0, b"").check("cuLaunchKernel", 700)
+    assert "rasterizer=" not in str(caught.value)
+
+
 def test_running_out_of_memory_is_not_a_user_error(stub):
     with pytest.raises(MemoryError, match="out of memory"), Module(stub, 0, b"").launching(0) as launch:
         launch("full", 1, 32)
