@@ -30,6 +30,7 @@ class ViewSettings:
     distance: float  # > 0, world units
     fov_y_deg: float  # in (0, 180)
     size: int  # >= 1, pixels
+    background: Sequence[float] | str  # RGB in [0, 1], or TRANSPARENT where that is allowed
 
     def __post_init__(self) -> None:
         require_range(f"{self.node}.distance", self.distance, above=0)
@@ -52,6 +53,11 @@ class ViewSettings:
         return orbit(
             azimuths_deg, elevations_deg, full * self.distance, full * self.fov_y_deg, self.size, self.size
         )
+
+    def backgrounds(self, views: int) -> Float[Tensor, "v 3"]:
+        """Return the background colour once per view; black if the pictures are transparent."""
+        color = (0.0, 0.0, 0.0) if isinstance(self.background, str) else self.background
+        return torch.tensor([[float(channel) for channel in color]] * views)
 
     def require_views(self, views: int) -> None:
         """Raise ``UserError`` unless ``views`` is a reasonable number of pictures."""
@@ -81,16 +87,10 @@ class PictureSettings(ViewSettings):
         super().__post_init__()
         require_color(f"{self.node}.background", self.background)
 
-    def backgrounds(self, views: int) -> Float[Tensor, "v 3"]:
-        """Return the background colour once per view."""
-        return torch.tensor([[float(channel) for channel in self.background]] * views)
-
 
 @dataclass(frozen=True, kw_only=True)
 class CutoutSettings(ViewSettings):
     """The same four settings for pictures that may be transparent where there is no object."""
-
-    background: Sequence[float] | str  # RGB in [0, 1], or TRANSPARENT
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -101,8 +101,3 @@ class CutoutSettings(ViewSettings):
     def is_transparent(self) -> bool:
         """Return whether the pictures have a fourth channel instead of a background."""
         return isinstance(self.background, str) and self.background == TRANSPARENT
-
-    def backgrounds(self, views: int) -> Float[Tensor, "v 3"]:
-        """Return the background colour once per view; black if the pictures are transparent."""
-        color = (0.0, 0.0, 0.0) if isinstance(self.background, str) else self.background
-        return torch.tensor([[float(channel) for channel in color]] * views)

@@ -56,11 +56,6 @@ class RowCount(RowState):
 
     no_rows: Bool[Tensor, "n"]  # all False: the mask that marks no Gaussian
 
-    @classmethod
-    def of(cls, n: int, device: torch.device) -> "RowCount":
-        """Return the state of ``n`` Gaussians."""
-        return cls(no_rows=torch.zeros(n, dtype=torch.bool, device=device))
-
 
 class Densifier(ABC, Generic[State]):
     """Frozen hyper-parameters; the per-Gaussian tensors are in a state that the trainer holds.
@@ -165,7 +160,7 @@ class GradientFree(Densifier[RowCount]):
 
     def init_state(self, n: int, device: torch.device) -> RowCount:
         """Return a state without statistics."""
-        return RowCount.of(n, device)
+        return RowCount(no_rows=torch.zeros(n, dtype=torch.bool, device=device))
 
     def observe(self, state: RowCount, signal: GradientSignal) -> RowCount:
         """Return the same state, because gradients decide nothing."""
