@@ -302,6 +302,7 @@ def test_a_launcher_configures_a_launcher_of_hydra(path):
 
 # Experiments with a pretrained prior, which test_recipes.py trains.
 RECIPES = {name for name in EXPERIMENTS if "/prior:" in (CONFIGS / "experiment" / f"{name}.yaml").read_text()}
+RECIPES |= {name for name in EXPERIMENTS if name.partition("_")[0] in RECIPES}
 RUN_ELSEWHERE = RECIPES | {"smoke"}  # test_end_to_end.py trains it
 
 

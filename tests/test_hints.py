@@ -63,7 +63,7 @@ LINES = [
     ((*TRAIN, "--cfg", "nope"), "nope"),
     ((*TRAIN, "--bogus"), "--bogus"),
     ((*TRAIN, "--config-dir", "nowhere"), "--config-dir: expected a folder"),
-    ((*TRAIN, "-m"), "-m: no such flag"),
+    ((*TRAIN, "-x"), "-x: no such flag"),
     (SWEEP, "sweep: nothing to sweep over"),
     ((*SWEEP, "sed=0,1"), "seed"),
     ((*SWEEP, "seed=0,1", "attempts=2"), "attempts: expected 1 in a sweep"),

@@ -22,8 +22,8 @@ from cadam3d.rasterizer.nvrtc import build
 Launch = Callable[..., None]
 LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 OUT_OF_MEMORY = 2  # CUDA_ERROR_OUT_OF_MEMORY
-# After a kernel has failed, every call of the process returns one of these, whoever launched the kernel: an
-# illegal address, a timeout, an assertion, and the errors of the hardware.
+# Errors that every later call returns after any kernel of the process has failed: an illegal address, a
+# timeout, an assertion, and the errors of the hardware.
 STICKY = (700, 702, 710, *range(714, 720))
 # Labels in the list of extra options of a launch: CU_LAUNCH_PARAM_END and so on.
 END, BUFFER_POINTER, BUFFER_SIZE = 0, 1, 2

@@ -1,5 +1,6 @@
 """Output: which exporter writes the file that ``output=NAME.SUFFIX`` names."""
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -74,7 +75,8 @@ def exporter_classes(folders: Sequence[Path]) -> dict[str, type[Exporter]]:
 
 def names_file(name: str) -> bool:
     """Return whether a value of ``output=`` names a file: it has a suffix and is not a folder that exists."""
-    return bool(Path(name).suffix) and not name.endswith("/") and not expanded(name).is_dir()
+    # Unlike Path.is_dir, this accepts a name that is too long, which is refused later by its key.
+    return bool(Path(name).suffix) and not name.endswith("/") and not os.path.isdir(expanded(name))  # noqa: PTH112
 
 
 def suffix_of(name: str, known: Mapping[str, object]) -> str:

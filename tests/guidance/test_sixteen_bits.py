@@ -44,11 +44,12 @@ def test_the_gradient_in_sixteen_bits_is_that_of_float32(objective, make, means,
     def on_latents(clean, reduction, t):
         class Encoded(gaussian):
             def encode(self, rgb):
-                return rgb
+                return leaf
 
         guidance = make(objective, reduction=reduction, t_min=t, t_max=t, **other)
         leaf, generator = clean.clone().requires_grad_(), torch.Generator().manual_seed(0)
-        guidance(leaf, replace(means, **texts), Encoded(DDPM()), 0, generator).loss.backward()
+        rgb = clean.new_zeros(VIEWS, 8, 8, 3)
+        guidance(rgb, replace(means, **texts), Encoded(DDPM()), 0, generator).loss.backward()
         return leaf.grad * DIVISORS[reduction](clean.shape) / DIVISORS[reduction](LARGE)
 
     kinds = [(reduction, t) for reduction in REDUCTIONS for t in ENDS]
