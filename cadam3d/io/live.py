@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Optional
 
 from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import TEMPORARY
@@ -39,7 +39,7 @@ KINDS = {
     "process": str,
     **dict.fromkeys(("step", "total_steps", "num_gaussians"), Whole),
     "seconds": Real,
-    "loss": Real | None,
+    "loss": Optional[Real],  # noqa: UP045  (an annotated type has no operator |)
     **dict.fromkeys(("is_paused", "has_ended"), bool),
     "statistics": dict[str, Real],
 }
