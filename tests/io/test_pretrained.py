@@ -55,7 +55,7 @@ def refusal(kind):
 
 @pytest.fixture(scope="module")
 def mixed(model, tmp_path_factory):
-    """A model of which only the UNet and the text encoder have files of the variant fp16."""
+    """Only the UNet and the text encoder of this model have files of the variant fp16."""
     import diffusers
 
     folder = tmp_path_factory.mktemp("mixed") / "model"
