@@ -19,12 +19,13 @@ from torch import Tensor
 from cadam3d.build import component
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.mesh.distance import true_surfaces
 from cadam3d.core.rendering import RenderOutput
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.mesh import read_mesh
 from cadam3d.io.ply import read_ply
 from cadam3d.io.run_folder import ASSET, CONFIG
-from cadam3d.metric.mesh import MeshMetric, distances_between, f_score, true_surfaces
+from cadam3d.metric.mesh import MeshMetric, distances_between, f_score
 from cadam3d.prior.shapes.scene import build, signed_distance
 from cadam3d.settings.compose import compose
 

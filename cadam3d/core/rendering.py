@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -97,6 +98,10 @@ class Subject:
     label: str = ""  # written under it
 
 
+# Vertices "v 3" and triangles "f 3".
+Triangles = tuple[np.ndarray, np.ndarray]
+
+
 @dataclass(frozen=True)
 class Truth:
     """The true object of a prompt, with which an asset is compared.
@@ -106,10 +111,9 @@ class Truth:
 
     # From cameras and one background per view, "v 3", to the true images of each mode, "m v h w 3" in [0, 1].
     images: Callable[[Cameras, Tensor], Tensor]
-    # From points "n 3" to signed distances "g n", one row for each of the ``g`` shapes of the modes; one row
-    # if all modes have the same shape. A distance is negative inside. Its sign is exact, and its size is at
-    # most the distance to the surface, in world units. None if the shape is not known.
-    distance: Callable[[Tensor], Tensor] | None = None
+    # The surface of each mode in world units, or a single one if all modes share it. None if the shape is not
+    # known.
+    surfaces: Callable[[], list[Triangles]] | None = None
     # From cameras to the alpha of each mode, "m v h w" in [0, 1]. None if the outlines are not known.
     alpha: Callable[[Cameras], Tensor] | None = None
     # The asset may face any side, and this many turns about the vertical axis are tried, evenly spaced. None
@@ -123,12 +127,12 @@ class Truth:
         """Return the object as the asset faces, turned by ``turn_deg``."""
         if not self.turn_deg:
             return self
-        images, distance, alpha, turn_deg = self.images, self.distance, self.alpha, self.turn_deg
+        images, surfaces, alpha, turn_deg = self.images, self.surfaces, self.alpha, self.turn_deg
 
-        def distance_there(points: Tensor) -> Tensor:
-            assert distance is not None
-            # The transposed matrix of the turn back is the matrix of the turn, and the points are rows.
-            return distance(points @ vertical_turn(turn_deg, points)[:3, :3])
+        def surfaces_there() -> list[Triangles]:
+            assert surfaces is not None
+            turn = vertical_turn(turn_deg, torch.zeros(1, dtype=torch.float64))[:3, :3].numpy()
+            return [(vertices @ turn.T, faces) for vertices, faces in surfaces()]
 
         def alpha_there(cameras: Cameras) -> Tensor:
             assert alpha is not None
@@ -137,7 +141,7 @@ class Truth:
         return replace(
             self,
             images=lambda cameras, background: images(cameras.turned(-turn_deg), background),
-            distance=None if distance is None else distance_there,
+            surfaces=None if surfaces is None else surfaces_there,
             alpha=None if alpha is None else alpha_there,
             turns=None,
             turn_deg=None,

@@ -1,25 +1,17 @@
 """MeshMetric: how close the surface of an asset is to the true surface, if that is known."""
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
-from torch import Tensor
 
 from cadam3d.core.checks import require_range, require_whole
-from cadam3d.core.mesh.surface import SurfaceSettings, areas, outer_shell
+from cadam3d.core.mesh.surface import SurfaceSettings, areas
 from cadam3d.core.number import Number
+from cadam3d.core.rendering import Triangles
 from cadam3d.metric.base import Measurand, Measurement, Metric
 
-# The true surface is marched in the cube [-1, 1]^3, which holds every object, with this many nodes per side.
-# It is off by up to a third of a cell (0.003 world units) at sharp edges, and by less than 0.0002 elsewhere.
-TRUE_NODES = 256
-CELL = 2.0 / TRUE_NODES  # world units
-COARSE_NODES = 32
 # Samples of a surface that lead to the triangles near a point.
 GUIDES = 200_000
 NEIGHBOURS = 8
@@ -78,11 +70,11 @@ class MeshMetric(SurfaceSettings, Metric):
         Raises ``UserError`` if the asset has no surface.
         """
         true = measurand.truth and measurand.truth.turned()
-        if true is None or true.distance is None:
+        if true is None or true.surfaces is None:
             return Measurement({})
         surface, _ = self.surface(measurand.gaussians)
         results = []
-        for vertices, faces in true_surfaces(true.distance):
+        for vertices, faces in true.surfaces():
             to_true, to_mesh = distances_between(
                 (surface.vertices, surface.faces), (vertices, faces), self.samples, self.seed
             )
@@ -92,21 +84,6 @@ class MeshMetric(SurfaceSettings, Metric):
         return Measurement(dict(zip(names, min(results), strict=True)))
 
 
-# Vertices "v 3" and triangles "f 3".
-Triangles = tuple[np.ndarray, np.ndarray]
-
-
-def true_surfaces(distance: Callable[[Tensor], Tensor]) -> list[Triangles]:
-    """Return the outer surface of each shape of a signed distance function (``Truth.distance``)."""
-    shapes = len(distance(torch.zeros(1, 3, dtype=torch.float64)))
-    found = []
-    for shape in range(shapes):
-        inside = -_sampled(lambda points, shape=shape: distance(points)[shape]) / CELL
-        vertices, faces = outer_shell(inside.clamp(-1, 1))
-        found.append(((vertices + 0.5) * CELL - 1, faces))
-    return found
-
-
 def f_score(
     to_true: Float[np.ndarray, "a"], to_mesh: Float[np.ndarray, "b"], threshold: float
 ) -> tuple[float, float, float]:
@@ -114,30 +91,6 @@ def f_score(
     precision, recall = float((to_true <= threshold).mean()), float((to_mesh <= threshold).mean())
     total = precision + recall
     return (2 * precision * recall / total if total > 0 else 0.0), precision, recall
-
-
-def _sampled(distance: Callable[[Tensor], Tensor]) -> Float[Tensor, "x y z"]:
-    """Return signed distances at the centres of ``TRUE_NODES``^3 cells, exact next to the surface.
-
-    Elsewhere they belong to the centre of a larger cell that the surface does not reach. A distance
-    function is never larger than the distance, so a cell with a larger one at its centre than its radius can
-    be left whole.
-    """
-    size, nodes = 2.0 / COARSE_NODES, COARSE_NODES
-    axis = torch.arange(nodes)
-    cells = torch.cartesian_prod(axis, axis, axis)
-    field = torch.zeros(nodes, nodes, nodes)
-    while True:
-        values = distance((cells.double() + 0.5) * size - 1)
-        field[cells[:, 0], cells[:, 1], cells[:, 2]] = values.float()
-        if nodes == TRUE_NODES:
-            return field
-        # The margin makes sure that a cell next to the surface has neighbours that are as fine.
-        is_near = values.abs() <= math.sqrt(3) * (size / 2 + CELL)
-        size, nodes = size / 2, nodes * 2
-        corner = torch.cartesian_prod(*[torch.arange(2)] * 3)
-        cells = (2 * cells[is_near][:, None] + corner).reshape(-1, 3)
-        field = field.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
 
 
 def distances_between(

@@ -8,8 +8,7 @@ from cadam3d.core.checks import fail, require_choice, require_whole, unless_none
 from cadam3d.core.errors import UserError
 from cadam3d.core.rendering import Truth
 from cadam3d.prior.base import DiffusionPrior
-from cadam3d.prior.shapes.prior import true_scene
-from cadam3d.prior.shapes.scene import build
+from cadam3d.prior.shapes.prior import shapes_scene
 from cadam3d.prior.shapes.tracing import TRACERS, find_tracer
 
 MOST_TURNS = 72
@@ -74,8 +73,8 @@ class ShapesTruth(TruthSource):
         """
         find_tracer(self.tracer, "truth.tracer")
         try:
-            scene = build(prompt)
+            scene = shapes_scene(prompt, "prompt", self.tracer)
         except UserError as error:
             expected = "a prompt of the embedded world, which truth=shapes draws"
             raise fail("truth", expected=expected, got=prompt, example="truth=prior") from error
-        return true_scene(scene, self.samples_per_pixel, self.turns, self.tracer)
+        return scene.truth(self.samples_per_pixel, self.turns)

@@ -1,16 +1,19 @@
 """MeshMetric: distances between surfaces that are known exactly."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
 from cadam3d.core.gaussians import Gaussians
+from cadam3d.core.mesh import distance
+from cadam3d.core.mesh.distance import true_surfaces
 from cadam3d.core.rendering import Truth
 from cadam3d.metric import mesh
 from cadam3d.metric.base import Measurand
-from cadam3d.metric.mesh import MeshMetric, distances_between, true_surfaces
+from cadam3d.metric.mesh import MeshMetric, distances_between
 from cadam3d.prior.shapes.scene import build, signed_distance
 
 SETTINGS = {
@@ -32,8 +35,8 @@ def ball(radius, x=0.0):
 def coarse():
     """Use coarser true surfaces and fewer samples, which takes less time."""
     patch = pytest.MonkeyPatch()
-    patch.setattr(mesh, "TRUE_NODES", 64)
-    patch.setattr(mesh, "CELL", 2.0 / 64)
+    patch.setattr(distance, "TRUE_NODES", 64)
+    patch.setattr(distance, "CELL", 2.0 / 64)
     patch.setattr(mesh, "GUIDES", 20_000)
     yield
     patch.undo()
@@ -60,6 +63,10 @@ def gaussian_ball() -> Gaussians:
 def measure(truth, **changes):
     ball = Measurand(gaussians=gaussian_ball(), render=never_renders, prompt="a ball", truth=truth)
     return MeshMetric(**{**SETTINGS, **changes}).measure(ball).numbers
+
+
+def shaped(distance_to):
+    return Truth(never_images, partial(true_surfaces, distance_to))
 
 
 def never_images(cameras, background):
@@ -101,8 +108,8 @@ def test_distances_to_large_triangles_are_exact():
 
 
 def test_a_right_mesh_has_a_high_score_and_a_wrong_one_a_low_one():
-    right = measure(Truth(never_images, ball(0.54)), threshold=0.03)
-    wrong = measure(Truth(never_images, ball(0.7)), threshold=0.03)
+    right = measure(shaped(ball(0.54)), threshold=0.03)
+    wrong = measure(shaped(ball(0.7)), threshold=0.03)
     assert right["mesh_fscore"] > 0.95
     assert right["mesh_chamfer"] < 0.03
     assert wrong["mesh_fscore"] == wrong["mesh_precision"] == wrong["mesh_recall"] == 0.0
@@ -113,7 +120,7 @@ def test_the_best_mode_counts():
     def both(points):
         return torch.cat([ball(0.7)(points), ball(0.54)(points)])
 
-    assert measure(Truth(never_images, both)) == measure(Truth(never_images, ball(0.54)))
+    assert measure(shaped(both)) == measure(shaped(ball(0.54)))
 
 
 def test_without_a_true_shape_there_are_no_numbers():

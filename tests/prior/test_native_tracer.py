@@ -215,8 +215,8 @@ def shapes(tracer: str) -> ShapesPrior:
 
 def test_without_a_compiler_auto_is_the_tracer_in_torch(no_compiler) -> None:
     assert find_tracer("auto").identity == "torch"
-    scene, background = build_scene("a cube"), torch.ones(2, 3)
-    means = [shapes(name).mixture(scene, views(), background).means for name in ("auto", "torch")]
+    priors = [shapes(name) for name in ("auto", "torch")]
+    means = [prior.mixture(prior.scene("a cube"), views(), torch.ones(2, 3)).means for prior in priors]
     assert torch.equal(*means)
 
 

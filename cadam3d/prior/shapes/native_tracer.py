@@ -11,15 +11,18 @@ import torch
 from cadam3d.compiled.library import SIMD, Names, NativeLibrary, build
 from cadam3d.core.cameras import Cameras
 from cadam3d.io.cache import kernels_dir
+from cadam3d.prior import light
+from cadam3d.prior.light import light_direction
 from cadam3d.prior.shapes import tracer
 from cadam3d.prior.shapes.scene import PATTERN_NAMES, Scene, sphere_directions
 from cadam3d.prior.shapes.solids import KINDS, STAR_POINTS
-from cadam3d.prior.shapes.tracer import Layers, ball_limits, light_direction, local_origins, ray_matrices
+from cadam3d.prior.shapes.tracer import Layers, ball_limits, local_origins, ray_matrices
 
 SOURCES = (Path(__file__).parent / "kernels" / "trace.cpp", SIMD)
 # Numbers of tracer.py that the kernels use too.
 CONSTANTS = ("MARCH_STEPS", "COMPACT_EVERY", "HIT_DISTANCE", "GRAZE_DISTANCE", "BALL_RADIUS", "NEAR")
-CONSTANTS += ("NORMAL_STEP", "AMBIENT", "SKY", "DIFFUSE", "WRAP", "SPOTS", "SPOT_COSINE")
+CONSTANTS += ("NORMAL_STEP", "SPOTS", "SPOT_COSINE")
+LIGHTS = ("AMBIENT", "SKY", "DIFFUSE", "WRAP")  # of light.py
 
 
 def tracer_library(key: str = "prior.tracer") -> NativeLibrary:
@@ -28,6 +31,7 @@ def tracer_library(key: str = "prior.tracer") -> NativeLibrary:
     The numbers of kinds and patterns are definitions, like the constants.
     """
     values = {name: getattr(tracer, name) for name in CONSTANTS} | {"STAR_POINTS": STAR_POINTS}
+    values |= {name: getattr(light, name) for name in LIGHTS}
     values |= {f"KIND_{kind.name.upper()}": number for number, kind in enumerate(KINDS)}
     values |= {f"PATTERN_{name.upper()}": number for number, name in enumerate(PATTERN_NAMES)}
     definitions = tuple(f"-DTRACE_{name}={value!r}" for name, value in values.items())

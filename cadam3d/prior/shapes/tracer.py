@@ -2,8 +2,7 @@
 
 Every part is traced separately, in its local coordinates and only by rays that hit its bounding box; the
 nearest hit is visible. All parts of one kind are traced together, so that the number of tensor operations
-does not grow with the number of parts. Light depends on the surface and not on the view, so that an asset of
-SH degree 0 can match it.
+does not grow with the number of parts.
 
 ``kernels/trace.cpp`` does the same on vectors of rays, with the same operations in the same order. Therefore
 sums of three products are written out here: a matrix product may add them in any order.
@@ -17,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
+from cadam3d.prior.light import dot, light_on, normalized
 from cadam3d.prior.shapes.scene import PATTERN_NAMES, Scene, sphere_directions
 from cadam3d.prior.shapes.solids import Kind, root
 
@@ -33,10 +33,6 @@ BALL_RADIUS = 0.9  # world units
 NEAR = 0.01  # world units
 # The step of the finite differences that give normals.
 NORMAL_STEP = 1e-3  # local coordinates
-# The direction towards the light; the front of objects faces +x.
-LIGHT = (0.60, 0.42, 0.68)
-# The first three sum to 1, so that nothing saturates.
-AMBIENT, SKY, DIFFUSE, WRAP = 0.46, 0.18, 0.36, 0.5
 SPOTS = 26
 # The cosine of the angular radius of a spot.
 SPOT_COSINE = 0.965
@@ -91,10 +87,10 @@ def _cast(cameras: Cameras, samples: int) -> _Rays:
     rows, columns = torch.arange(fine.height, **like), torch.arange(fine.width, **like)
     y, x = torch.meshgrid(rows + 0.5, columns + 0.5, indexing="ij")
     u, v, w = to_world[:, :, :, None].unbind(2)  # columns, "v 3 1" each
-    direction = _unit((u * x.flatten() + v * y.flatten() + w).transpose(0, 1))  # "3 v r"
+    direction = normalized((u * x.flatten() + v * y.flatten() + w).transpose(0, 1))  # "3 v r"
 
-    along = _dot(origins.T[:, :, None], direction)
-    apart = _dot(origins.T, origins.T)[:, None] - along.clamp_max(0).square()
+    along = dot(origins.T[:, :, None], direction)
+    apart = dot(origins.T, origins.T)[:, None] - along.clamp_max(0).square()
     view, sample = (apart <= BALL_RADIUS**2).nonzero(as_tuple=True)
     row = torch.div(sample, fine.width * samples, rounding_mode="floor")
     column = torch.div(sample % fine.width, samples, rounding_mode="floor")
@@ -134,7 +130,7 @@ def _candidates(scene: Scene, rays: _Rays) -> tuple[Int[Tensor, "n"], Int[Tensor
     """Return the pairs (part, ray) in which the ray hits the bounding ball of the part, sorted by part."""
     balls = zip(*ball_limits(scene, rays.origins), rays.directions.split(rays.per_view, dim=1), strict=True)
     masks = [
-        _dot(away.T[:, :, None], direction[:, None]) >= least[:, None] for away, least, direction in balls
+        dot(away.T[:, :, None], direction[:, None]) >= least[:, None] for away, least, direction in balls
     ]
     part, ray = torch.cat(masks, dim=1).nonzero(as_tuple=True)
     return part, ray
@@ -146,7 +142,7 @@ def _first_hits(scene: Scene, rays: _Rays) -> tuple[Int[Tensor, "n"], Int[Tensor
     # The same rays in the local coordinates of the parts. The ray parameter stays in world units.
     start = local_origins(scene, rays.origins).flatten(0, 1).T
     origin = start.index_select(1, rays.views[ray] * len(scene.radii) + part)
-    direction = _dot(_matrices(scene, part).transpose(0, 1), rays.directions.index_select(1, ray)[:, None])
+    direction = dot(_matrices(scene, part).transpose(0, 1), rays.directions.index_select(1, ray)[:, None])
     begin, end = _box_interval(scene, part, origin, direction)
     inside = (begin < end).nonzero()[:, 0]
     part, ray, begin, end = part[inside], ray[inside], begin[inside], end[inside]
@@ -190,7 +186,7 @@ def _march(
     """Return the ray parameter of the first point on the surface, or infinity for a miss."""
     reached = torch.full_like(begin, torch.inf)
     rows = torch.arange(len(begin), device=begin.device)
-    t, speed = begin, _dot(direction, direction).rsqrt()
+    t, speed = begin, dot(direction, direction).rsqrt()
     for step in range(MARCH_STEPS):
         advance = kind.sdf(origin + t * direction, sizes) * speed
         t = t + advance
@@ -229,10 +225,8 @@ def _shade(scene: Scene, part: Tensor, local: Tensor) -> tuple[Float[Tensor, "n"
     for kind, rows in _runs(scene, part):
         normal[:, rows] = _gradient(kind, local[:, rows], sizes[:, rows])
     # A normal is mapped to the world by the transposed inverse of the matrix that maps points.
-    normal = _unit(_dot(_matrices(scene, part), normal[:, None]))
-    light = light_direction(normal)
-    facing = ((_dot(light, normal) + WRAP) / (1 + WRAP)).clamp_min(0)
-    sent = AMBIENT + SKY * (0.5 + 0.5 * normal[2]) + DIFFUSE * facing
+    normal = normalized(dot(_matrices(scene, part), normal[:, None]))
+    sent = light_on(normal)
 
     is_second = torch.zeros_like(part, dtype=torch.bool)
     pattern = scene.patterns[part]
@@ -245,21 +239,6 @@ def _shade(scene: Scene, part: Tensor, local: Tensor) -> tuple[Float[Tensor, "n"
             box = ((scene.high + scene.low) / 2).T[:, own], ((scene.high - scene.low) / 2).T[:, own]
             is_second[chosen] = _paint_second(kind, name, local[:, chosen], sizes[:, chosen], box)
     return sent, torch.where(is_second, scene.paints[part, 1], scene.paints[part, 0])
-
-
-def light_direction(like: Tensor) -> Float[Tensor, "3"]:
-    """Return the unit vector towards the light, on the device and in the dtype of ``like``."""
-    return _unit(like.new_tensor(LIGHT))
-
-
-def _unit(vectors: Tensor) -> Tensor:
-    """Normalize vectors that have their components along the first axis."""
-    return vectors * _dot(vectors, vectors).clamp_min(1e-30).rsqrt()
-
-
-def _dot(one: Tensor, other: Tensor) -> Tensor:
-    """Return the products of vectors that have their components along the first axis, added in order."""
-    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 
 def _gradient(kind: Kind, points: Tensor, sizes: Tensor) -> Tensor:
@@ -280,7 +259,7 @@ def _paint_second(
         turn, roll = torch.atan2(p[1], p[0]), torch.atan2(p[2], root(p[0] * p[0] + p[1] * p[1]) - sizes[0])
         return _ring_pattern(pattern, turn / torch.pi, roll / torch.pi)
     if pattern == "spotted":
-        return (sphere_directions(SPOTS).to(p) @ _unit(unit)).amax(0) > SPOT_COSINE
+        return (sphere_directions(SPOTS).to(p) @ normalized(unit)).amax(0) > SPOT_COSINE
     if kind.wrap == "flat":
         # Slightly smaller, so that faces are not on the border between two cells.
         inner = 0.999 * unit

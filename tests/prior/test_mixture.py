@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from cadam3d.prior.mixture import Mixture
 from cadam3d.prior.path import DDPM, NoisePath, RectifiedFlow, per_view
-from cadam3d.prior.shapes.mixture import Mixture
 
 PATHS = [pytest.param(DDPM(), id="ddpm"), pytest.param(RectifiedFlow(), id="flow")]
 WEIGHTS = torch.tensor([0.5, 0.3, 0.2], dtype=torch.float64)
@@ -21,7 +21,7 @@ def small(views: int, sigma: Tensor = SIGMA) -> Mixture:
     return Mixture(
         means=MEANS.reshape(1, 3, 1, 1, 2).expand(views, -1, -1, -1, -1),
         log_weights=WEIGHTS.log(),
-        variance=sigma.square().reshape(1, 1, 1, 2).expand(views, -1, -1, -1),
+        variance=sigma.square().reshape(1, 1, 1, 1, 2).expand(views, -1, -1, -1, -1),
     )
 
 
@@ -33,13 +33,13 @@ def draw(count: int, generator: torch.Generator) -> Tensor:
 
 
 def total_variance(mixture: Mixture, a: Tensor, b: Tensor) -> Tensor:
-    return per_view(a) ** 2 * mixture.variance + per_view(b) ** 2
+    return per_view(a)[:, None] ** 2 * mixture.variance + per_view(b)[:, None] ** 2
 
 
 def log_density(mixture: Mixture, noisy: Tensor, a: Tensor, b: Tensor) -> Tensor:
     total = total_variance(mixture, a, b)
-    norm = (2 * torch.pi * total).log().sum(dim=(1, 2, 3))
-    return mixture.log_joint(noisy, per_view(a), total).logsumexp(dim=1) - 0.5 * norm
+    norm = (2 * torch.pi * total).log().sum(dim=(1, 2, 3, 4))
+    return mixture.log_joint(noisy, per_view(a)[:, None], total).logsumexp(dim=1) - 0.5 * norm
 
 
 def at(path: NoisePath, t: float, views: int = 1) -> tuple[Tensor, Tensor, Tensor]:
@@ -119,7 +119,7 @@ def test_without_spread_and_noise_the_nearest_mode_is_returned() -> None:
 def test_large_images_do_not_underflow() -> None:
     """The density of an image of 100,000 pixels is below the smallest float; responsibilities stay right."""
     means = torch.stack([torch.zeros(3, 200, 200), torch.full((3, 200, 200), 0.01)])[None]
-    mixture = Mixture(means, torch.full((2,), math.log(0.5)), torch.full((1, 3, 200, 200), 0.04))
+    mixture = Mixture(means, torch.full((2,), math.log(0.5)), torch.full((1, 1, 3, 200, 200), 0.04))
     noisy = torch.full((1, 3, 200, 200), 0.005)
     clean, _ = mixture.denoise(noisy, torch.ones(1), torch.full((1,), 0.5))
     torch.testing.assert_close(clean, noisy, atol=1e-5, rtol=0)
