@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
+from cadam3d.prior.light import AMBIENT, DIFFUSE, LIGHT, SKY, WRAP
 from cadam3d.prior.shapes.grammar import parse
 from cadam3d.prior.shapes.objects import Part, known_objects, known_primitives
 from cadam3d.prior.shapes.scene import FIT_RADIUS, Scene, assemble, build, compile_scene, sphere_directions
-from cadam3d.prior.shapes.tracer import AMBIENT, DIFFUSE, LIGHT, SKY, WRAP, Layers, trace
+from cadam3d.prior.shapes.tracer import Layers, trace
 from cadam3d.prior.shapes.words import COLOURS
 
 PROMPTS = (
