@@ -42,12 +42,12 @@ def launch(command: str, words: Sequence[str]) -> int:
         if command == "sweep":
             from cadam3d.commands import sweep
 
-            return sweep.run(line.overrides, line.flags, line.options)
+            return sweep.run(line)
         cfg = _composed(line)
         if cfg.get("attempts", 1) > 1:
             from cadam3d.commands import attempts
 
-            return attempts.run(cfg, line.overrides, line.flags, line.options, line.words)
+            return attempts.run(cfg, line)
         call = _call(line, cfg)
         module = import_module(f"cadam3d.commands.{command}")
     # Imported modules stay in memory, so the garbage collector need not scan them.
@@ -145,8 +145,8 @@ def _show_page(line: Line) -> None:
         from cadam3d.sweep.plan import read_sweep
 
         # The page of a sweep shows the settings of its first job.
-        sweep = read_sweep(line.overrides, line.options)
-        run_hydra("sweep", [*sweep.parts.own, *sweep.jobs[0].overrides, *line.flags])
+        sweep = read_sweep(line)
+        run_hydra("sweep", [*sweep.parts.own, *sweep.plan.jobs[0].overrides, *line.flags])
     else:
         run_hydra(line.command, [*line.overrides, *line.flags])
 

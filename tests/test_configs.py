@@ -22,6 +22,7 @@ from cadam3d.build import component, components
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import read_json, read_jsonl
 from cadam3d.io.prompt_files import read_prompts
+from cadam3d.launch import read_line
 from cadam3d.settings.compose import compose, flatten, quote
 from cadam3d.settings.line import read_flags
 from cadam3d.settings.options import config_dir
@@ -264,7 +265,7 @@ def test_every_arm_of_a_grid_composes(grid, monkeypatch):
 
     The number of jobs that the file claims is compared with the product of all.
     """
-    monkeypatch.setattr(plan, "compose", lambda line, command, _: line_of_jobs(command, tuple(line)))
+    monkeypatch.setattr(plan, "compose", lambda line, command, _: line_of_jobs(command, tuple(line)).copy())
     text = (CONFIGS / "grid" / f"{grid}.yaml").read_text(encoding="utf-8")
     shared = {
         k: v for k, v in yaml.safe_load(text).get("each", {}).items() if isinstance(v, list) and len(v) > 1
@@ -278,12 +279,12 @@ def test_every_arm_of_a_grid_composes(grid, monkeypatch):
     named = yaml.safe_load(text).get("prompts")
     line += [] if "prompt" in axes else ["prompts.first=1" if named else PROMPT]
     of_set = len(read_prompts(named)) if named else 1
-    sweep = read_sweep(line, NO_FLAGS)
-    assert len(sweep.jobs) > 1
+    sweep = read_sweep(read_line("sweep", line))
+    assert len(sweep.plan.jobs) > 1
     claimed = re.search(r": ([\d,]+) jobs", text)
-    counted = len(sweep.jobs) * math.prod(len(values) for values in axes.values()) * of_set
+    counted = len(sweep.plan.jobs) * math.prod(len(values) for values in axes.values()) * of_set
     assert claimed is None or int(claimed.group(1).replace(",", "")) == counted
-    cfg = OmegaConf.to_container(compose(sweep.jobs[-1].overrides), resolve=True)
+    cfg = OmegaConf.to_container(compose(sweep.plan.jobs[-1].overrides), resolve=True)
     # A setting that names another node, such as prior.prompting, keeps that node as its value in a sweep.
     assert dict(flatten(sweep.composed[-1].values)) == dict(flatten(cfg))
 

@@ -1,7 +1,5 @@
 """``cadam3d train attempts=N``: train several seeds, keep all of them, and link the best one."""
 
-from argparse import Namespace
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +12,7 @@ from cadam3d.core.number import preferred
 from cadam3d.io.jsonl import write_json
 from cadam3d.io.links import link
 from cadam3d.io.run_folder import ASSET, BEST, CHOICE, LATEST, REPORT, setting_word, shown
+from cadam3d.settings.line import Line
 from cadam3d.sweep.choice import (
     Choice,
     attempt_of,
@@ -28,23 +27,16 @@ from cadam3d.sweep.folder import load, rows_of
 from cadam3d.sweep.start import run_sweep
 
 
-def run(
-    cfg: DictConfig,
-    overrides: Sequence[str],
-    flags: Sequence[str],
-    options: Namespace,
-    words: Sequence[str],
-) -> int:
+def run(cfg: DictConfig, line: Line) -> int:
     """Train the attempts that a line asks for, choose the best and report on them; return the exit code.
 
-    ``overrides`` are quoted for Hydra, and ``words`` are the same as they were typed. The code is 0 if every
-    attempt has a result and one was chosen, or after a dry run.
+    The code is 0 if every attempt has a result and one was chosen, or after a dry run.
     """
     select = cfg.get("select")
-    sweep, numbers = read_attempts(cfg, overrides, options), selectable_numbers(options)
-    existing = [attempt_of(row) for row in rows_of(sweep.folder, sweep.jobs)]
+    sweep, numbers = read_attempts(cfg, line), selectable_numbers(line.folders)
+    existing = [attempt_of(row) for row in rows_of(sweep.folder, sweep.plan.jobs)]
     require_measured(select, numbers, list(cfg.get("metric") or ()), existing)
-    ended = run_sweep(sweep, words, flags, on_start=partial(link, Path(LATEST)))
+    ended = run_sweep(sweep, on_start=partial(link, Path(LATEST)))
     if ended.was_dry:
         return ended.code
     rows = load(ended.folder)
@@ -63,8 +55,8 @@ def run(
     elif any(attempt.numbers for attempt in attempts):
         names = [each.name for each in preferred(numbers.values())] if select is None else [select]
         # The last of several needs no truth.
-        line = measuring_line(ended.folder, numbers[names[-1]])
-        raise UserError(f"select: no attempt has {' or '.join(names)}. Measure them first. Try: {line}")
+        again = measuring_line(ended.folder, numbers[names[-1]])
+        raise UserError(f"select: no attempt has {' or '.join(names)}. Measure them first. Try: {again}")
     return ended.code
 
 

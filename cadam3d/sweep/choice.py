@@ -1,7 +1,6 @@
 """Choice: several seeds of one run as the jobs of a sweep, and the best of them by one number."""
 
 import shlex
-from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,8 +15,8 @@ from cadam3d.core.outcome import Outcome
 from cadam3d.io.records import difference, read_scores
 from cadam3d.io.run_folder import LATEST, RUN_FOLDER, shown
 from cadam3d.settings.compose import slug
-from cadam3d.settings.line import key_of
-from cadam3d.settings.options import config_dir, option_class, option_names
+from cadam3d.settings.line import Line, key_of
+from cadam3d.settings.options import option_class, option_names
 from cadam3d.sweep.folder import Job, Row, numbers_of
 from cadam3d.sweep.grid import read_line, sweep_name
 from cadam3d.sweep.plan import (
@@ -26,6 +25,7 @@ from cadam3d.sweep.plan import (
     compose_all,
     compose_sweep,
     folder_of,
+    plan_of,
     search_path,
     sort_overrides,
 )
@@ -70,41 +70,35 @@ class Choice:
         )
 
 
-def read_attempts(cfg: DictConfig, overrides: Sequence[str], options: Namespace) -> Sweep:
+def read_attempts(cfg: DictConfig, line: Line) -> Sweep:
     """Return the attempts that a line of ``cadam3d train`` asks for as a sweep.
 
-    ``cfg`` is the configuration of the line, and ``overrides`` are quoted for Hydra. The folder is that of
-    ``hydra.run.dir=`` in the line. Otherwise its name follows from the line without ``attempts=`` and
-    ``select=``, so that more attempts, or a choice by another number, find the attempts that exist. Raises
-    ``UserError`` for settings that cannot be combined with attempts.
+    ``cfg`` is the configuration of the line. The folder is that of ``hydra.run.dir=`` in the line. Otherwise
+    its name follows from the line without ``attempts=`` and ``select=``, so that more attempts, or a choice
+    by another number, find the attempts that exist. Raises ``UserError`` for settings that cannot be combined
+    with attempts.
     """
     require_whole("seed", cfg.seed, low=0)
     if cfg.get("resume") is not None:
         raise fail("attempts", expected="1 with resume=", got=cfg.attempts)
-    parts = sort_overrides([override for override in overrides if key_of(override) not in OF_THE_LINE])
+    given = {key_of(override) for override in line.overrides}
+    parts = sort_overrides([override for override in line.overrides if key_of(override) not in OF_THE_LINE])
     common = [override for override in parts.jobs if key_of(override) != "seed"]
     # Attempts that YAML files ask for would otherwise start attempts themselves.
-    common += [] if any(key_of(override) == "attempts" for override in overrides) else ["attempts=1"]
-    seeds = range(cfg.seed, cfg.seed + cfg.attempts)
+    common += [] if "attempts" in given else ["attempts=1"]
     jobs = [
         Job("", f"{SEED}{seed}", [*common, f"seed={seed}"], {"prompt": cfg.prompt, "seed": seed})
-        for seed in seeds
+        for seed in range(cfg.seed, cfg.seed + cfg.attempts)
     ]
-    own = compose_sweep(parts, options)
+    own = compose_sweep(parts, line.options)
     place = Path(str(cfg.hydra.run.dir))
-    if not any(key_of(override) == RUN_FOLDER for override in overrides):
+    if RUN_FOLDER not in given:
         # The prompt, and a digest of everything typed.
         digest = sweep_name(None, read_line(parts.jobs)).rpartition("_")[2]
         place = PARENT / f"{slug(str(cfg.prompt))}_{digest}"
-    return Sweep(
-        cfg=own,
-        parts=parts,
-        folder=folder_of(own, parts, place),
-        jobs=jobs,
-        composed=compose_all(jobs, Composer(options, search_path(overrides))),
-        figures=["growth"],
-        command="train",
-    )
+    composed = compose_all(jobs, Composer(line.options, search_path(line.overrides)))
+    plan = plan_of(line, jobs, "train", figures=["growth"])
+    return Sweep(line, own, parts, folder_of(own, parts, place), plan, composed)
 
 
 def attempt_of(row: Row) -> Attempt:
@@ -137,12 +131,11 @@ def choose(attempts: Sequence[Attempt], select: str | None) -> Choice | None:
     return None
 
 
-def selectable_numbers(options: Namespace) -> dict[str, Number]:
+def selectable_numbers(folders: Sequence[Path]) -> dict[str, Number]:
     """Return the numbers by which attempts can be compared, whichever metrics are chosen, by name.
 
-    These are the numbers of which more or less is better, of all metrics of the package and ``--config-dir``.
+    These are the numbers of which more or less is better. ``folders`` have the YAML files of the metrics.
     """
-    folders = [*([Path(options.config_dir)] if options.config_dir else []), config_dir()]
     found = [
         replace(number, metric=name)
         for name in option_names("metric", folders)

@@ -2,13 +2,12 @@
 
 import re
 from argparse import Namespace
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import InterpolationResolutionError
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from cadam3d.core.checks import fail, require, require_whole
 from cadam3d.core.errors import UserError
@@ -16,9 +15,9 @@ from cadam3d.io.run_folder import RUN_FOLDER, typed_path
 from cadam3d.settings.advice import explain
 from cadam3d.settings.check import require_effective, require_settings
 from cadam3d.settings.compose import compose, flatten, value_of
-from cadam3d.settings.line import DRY_RUN, LAUNCHER_KEY, SWEEP_FOLDER, key_of
+from cadam3d.settings.line import DRY_RUN, LAUNCHER_KEY, SWEEP_FOLDER, Line, key_of
 from cadam3d.settings.options import with_example
-from cadam3d.sweep.folder import Job
+from cadam3d.sweep.folder import Job, Plan
 from cadam3d.sweep.grid import (
     ALWAYS_SHOWN,
     Axes,
@@ -37,8 +36,6 @@ PARENT = Path("multirun")
 VALUE = re.compile(r"[A-Za-z_][\w.]*=(?!.*\$\{)", re.DOTALL)
 GRID_KEY = re.compile(r"(grid|prompts)($|\.)")
 REFUSED_KEY = re.compile(r"hydra\.run\.dir$|hydra\.sweep\.subdir$|hydra[./]sweeper($|\.)")
-# In an interpolation: a reference to another setting, or the call of a function of this package.
-REFERENCE = re.compile(r"\$\{(?:cadam3d\.\w+:|([A-Za-z_][\w.]*)\})")
 MOST_ATTEMPTS = 1000
 NOTHING_TO_SWEEP = "sweep: nothing to sweep over. Try: densifier=baseline,cadam"
 
@@ -64,7 +61,6 @@ class Composed:
 
     values: dict[str, Any]  # by dotted key
     choices: Mapping[str, Any]  # by group
-    unknown: set[str]  # keys with values that only a running job has
 
     def get(self, key: str) -> Any:
         """Return a value, or the option chosen of a group; None if the job has no such key."""
@@ -75,16 +71,12 @@ class Composed:
 class Sweep:
     """A sweep that a line describes, planned but not started."""
 
+    line: Line
     cfg: DictConfig  # the grid, the launcher, Hydra's node
     parts: Parts  # of the line
     folder: Path  # which may not exist yet
-    jobs: list[Job]
+    plan: Plan
     composed: list[Composed]  # the settings of each job
-    figures: list[str] | None = None  # of its report; None: all for which there are data
-    paper_table: bool = False
-    command: Literal["sweep", "train"] = (
-        "sweep"  # of the line; "train" if the jobs are several attempts at one run
-    )
 
     @property
     def is_dry(self) -> bool:
@@ -94,156 +86,119 @@ class Sweep:
     @property
     def folder_key(self) -> str:
         """Return the setting that chooses the folder."""
-        return RUN_FOLDER if self.command == "train" else SWEEP_FOLDER
+        return RUN_FOLDER if self.plan.command == "train" else SWEEP_FOLDER
 
     def count(self, number: int) -> str:
         """Return a number of jobs in words."""
-        noun = "attempt" if self.command == "train" else "job"
+        noun = "attempt" if self.plan.command == "train" else "job"
         return f"1 {noun}" if number == 1 else f"{number} {noun}s"
 
 
-@dataclass(frozen=True)
 class Base:
-    """A composed job from which other jobs differ in plain values of the same keys only."""
+    """A composed job from which other jobs differ in plain values of its settings only."""
 
-    cfg: DictConfig
-    plain: dict[str, Any]  # by dotted key
-    referring: dict[str, list[str]]  # by key of an interpolation: the keys on whose values it depends
-    # What interpolations have become, by key and by the values on which they depend. OmegaConf would parse
-    # each of them again for every job.
-    _resolved: dict[tuple[str, ...], dict[str, Any]] = field(default_factory=dict)
+    def __init__(self, cfg: DictConfig) -> None:
+        """Keep ``cfg``, which has Hydra's own node."""
+        with open_dict(cfg):
+            self.choices: Mapping[str, Any] = cfg.pop("hydra").runtime.choices
+        self._cfg = cfg
+        # All settings by dotted key; an interpolation is text.
+        self.leaves = dict(flatten(OmegaConf.to_container(cfg, resolve=False)))
+        self._referring = {key: str(value) for key, value in self.leaves.items() if "${" in str(value)}
+        self._plain = {key: value for key, value in self.leaves.items() if key not in self._referring}
+        # What interpolations refer to, apart from the names of functions.
+        self._words = set(re.findall(r"\w+", " ".join(self._referring.values())))
+        # What interpolations have become, by the values on which they depend. OmegaConf would parse each of
+        # them again for every job.
+        self._resolved: dict[tuple[str, ...], dict[str, Any]] = {}
 
-    @classmethod
-    def of(cls, cfg: DictConfig, varying: Collection[str]) -> "Base":
-        """Return ``cfg`` with its values sorted into plain ones and interpolations, without Hydra's own.
+    def composed(self, values: Mapping[str, Any], overrides: Sequence[str]) -> Composed:
+        """Return the job with other ``values``, which the ``overrides`` of the job set.
 
-        Jobs differ in the values of the keys ``varying``.
+        Raises ``UserError`` if a setting has no value, or an override no effect.
         """
-        raw = OmegaConf.to_container(cfg, resolve=False)
-        assert isinstance(raw, dict)
-        raw.pop("hydra", None)
-        leaves = dict(flatten(raw))
-        texts = {key: str(value) for key, value in leaves.items() if "${" in str(value)}
-        plain = {key: leaves[key] for key in leaves.keys() - texts.keys()}
-        return cls(cfg, plain, {key: _causes(key, texts, varying) for key in texts})
+        causes = [key for key in values if key.partition(".")[0] in self._words]
+        state = (*sorted(values), *(repr(values[key]) for key in causes))
+        if state not in self._resolved:
+            self._resolved[state] = self._resolve(values, overrides)
+        return Composed({**self._plain, **self._resolved[state], **values}, self.choices)
 
-    def composed(self, values: Mapping[str, Any]) -> Composed:
-        """Return the job with other ``values``, set as Hydra sets them."""
-        for key, value in values.items():
-            OmegaConf.update(self.cfg, key, value, merge=True)
-        resolved: dict[str, Any] = {}
-        unknown: set[str] = set()
-        for key, causes in self.referring.items():
-            state = (key, *(repr(values.get(cause)) for cause in causes))
-            if state not in self._resolved:
-                self._resolved[state] = self._resolve(key)
-            resolved |= self._resolved[state]
-            unknown |= set() if self._resolved[state] else {key}
-        return Composed(
-            values={**self.plain, **values, **resolved},
-            choices=self.cfg.hydra.runtime.choices,
-            unknown=unknown,
-        )
-
-    def _resolve(self, key: str) -> dict[str, Any]:
-        """Return the value of an interpolation by key; {} if only a running job has it.
+    def _resolve(self, values: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+        """Return the values of all interpolations by key.
 
         A reference to a whole part, such as ``${prompting}``, stands for all its settings.
         """
-        try:
-            node = OmegaConf.select(self.cfg, key)
-        except InterpolationResolutionError:  # such as ${hydra:...}
-            return {}
-        plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
-        return dict(flatten(plain, key))
-
-
-def _causes(key: str, texts: Mapping[str, str], varying: Collection[str]) -> list[str]:
-    """Return the keys of ``varying`` on which an interpolation depends, directly or by way of others."""
-    seen, new = {key}, [key]
-    causes: set[str] = set()
-    while new:
-        text = texts[new.pop()]
-        references = REFERENCE.findall(text)
-        if len(references) < text.count("${"):
-            return list(varying)
-        for one in filter(None, references):
-            causes |= {each for each in varying if _overlap(each, one)}
-            more = {each for each in texts if _overlap(each, one)} - seen
-            seen |= more
-            new += more
-    return sorted(causes)
-
-
-def _overlap(one: str, other: str) -> bool:
-    """Return whether two dotted keys are equal, or one is a part of the other."""
-    return f"{one}.".startswith(f"{other}.") or f"{other}.".startswith(f"{one}.")
+        cfg = self._cfg.copy()
+        for key, value in values.items():
+            OmegaConf.update(cfg, key, value)
+        require_effective(cfg, "sweep", overrides)
+        found: dict[str, Any] = {}
+        for key in self._referring.keys() - values.keys():
+            node = OmegaConf.select(cfg, key)
+            plain = OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
+            found |= flatten(plain, key)
+        return found
 
 
 class Composer:
     """Composes many lines of ``cadam3d train`` quickly.
 
     Hydra needs a sixth of a second for one line, and most jobs of a sweep differ in plain values only. Lines
-    that choose the same parts and set the same keys are therefore composed only once.
+    that choose the same parts are therefore composed only once.
     """
 
     def __init__(self, options: Namespace, common: Sequence[str]) -> None:
         self._options, self._common = options, list(common)
         self._bases: dict[tuple[str, ...], Base] = {}
-        self._keys: dict[tuple[str, ...], list[str]] = {}  # settings and groups, by overrides
-        self._leaves = self._base([]).plain.keys()
 
     def compose(self, overrides: Sequence[str]) -> Composed:
         """Return the settings under ``overrides``. Raises if they cannot be composed or lack a value."""
+        settings = self._base(self._parts(overrides)).leaves
+        values = {key_of(line): value_of(line) for line in overrides if VALUE.match(line)}
         # An override that chooses an option, or replaces a part, is no value of the composed job.
-        lines = {key_of(line): line for line in overrides if self._may_be_value(line)}
-        while not lines.keys() <= (base := self._base_without(lines.values(), overrides)).plain.keys():
-            lines = {key: line for key, line in lines.items() if key in base.plain}
-        composed = base.composed({key: value_of(line) for key, line in lines.items()})
+        values = {key: each for key, each in values.items() if key in settings and not isinstance(each, dict)}
+        base = self._base(line for line in overrides if key_of(line) not in values)
+        composed = base.composed(values, overrides)
         require_settings(composed.values)
         return composed
 
     def has(self, overrides: Sequence[str], key: str) -> bool:
         """Return whether a job under ``overrides`` has a setting or a group called ``key``."""
-        # Which settings there are does not depend on plain values.
-        arm = tuple(line for line in overrides if not self._may_be_value(line))
-        if arm not in self._keys:
-            base = self._base(arm)
-            self._keys[arm] = [*base.plain, *base.referring, *base.cfg.hydra.runtime.choices]
-        return any(f"{known}.".startswith(f"{key}.") for known in self._keys[arm])
+        base = self._base(self._parts(overrides))
+        return any(f"{known}.".startswith(f"{key}.") for known in (*base.leaves, *base.choices))
 
-    def _may_be_value(self, line: str) -> bool:
-        """Return whether an override may set a plain value, and surely chooses no option."""
-        return bool(VALUE.match(line)) and ("." in (key := key_of(line)) or key in self._leaves)
+    def _parts(self, overrides: Sequence[str]) -> list[str]:
+        """Return the overrides that may choose parts of a job; which settings it has depends on no others."""
+        values = self._base(()).leaves
+        return [
+            line
+            for line in overrides
+            if not VALUE.match(line) or ("." not in (key := key_of(line)) and key not in values)
+        ]
 
-    def _base_without(self, values: Collection[str], overrides: Sequence[str]) -> Base:
-        """Return a job under ``overrides`` that differs from others in ``values``, composed only once."""
-        known = tuple(key_of(line) if line in values else line for line in overrides)
+    def _base(self, overrides: Iterable[str]) -> Base:
+        """Return the job under ``overrides``, composed only once."""
+        known = tuple(overrides)
         if known not in self._bases:
-            base = self._base(overrides, [key_of(line) for line in values])
-            require_effective(base.cfg, "sweep", overrides)
-            self._bases[known] = base
+            self._bases[known] = Base(compose([*self._common, *known], "train", self._options))
         return self._bases[known]
 
-    def _base(self, overrides: Sequence[str], varying: Collection[str] = ()) -> Base:
-        return Base.of(compose([*self._common, *overrides], "train", self._options), varying)
 
-
-def read_sweep(overrides: Sequence[str], options: Namespace) -> Sweep:
+def read_sweep(line: Line) -> Sweep:
     """Return the sweep that a line describes.
 
     Raises ``UserError`` for a line with a single job or with settings that a sweep cannot have, and for the
     first job that cannot run.
     """
-    parts = sort_overrides(overrides)
-    cfg = compose_sweep(parts, options)
+    parts = sort_overrides(line.overrides)
+    cfg = compose_sweep(parts, line.options)
     node = cfg.get("grid")
     grid = read_grid(None if node is None else OmegaConf.to_container(node, resolve=True))
     axes = read_line(parts.jobs)
     prompts = _read_prompts(cfg, grid, axes)
     if prompts is not None:
         axes = {"prompt": prompt_axis(prompts.read())} | axes
-    composer = Composer(options, search_path(overrides))
+    composer = Composer(line.options, search_path(line.overrides))
     jobs = expand(grid, axes, composer.has)
     if node is None and prompts is None and len(jobs) == 1:
         raise UserError(NOTHING_TO_SWEEP)
@@ -251,18 +206,34 @@ def read_sweep(overrides: Sequence[str], options: Namespace) -> Sweep:
     # A report must know a threshold that is not the shipped one, even if all jobs share it.
     thresholds = [key for key in axes if key.startswith("densifier.")]
     keys = dict.fromkeys([*ALWAYS_SHOWN, *swept_keys(grid, axes), *thresholds])
+    jobs = [
+        replace(job, swept={key: settings.get(key) for key in keys})
+        for job, settings in zip(jobs, composed, strict=True)
+    ]
+    plan = plan_of(line, jobs, "sweep", grid.figures, grid.paper_table)
     name = sweep_name(cfg.hydra.runtime.choices.get("grid"), axes, prompts)
-    return Sweep(
-        cfg=cfg,
-        parts=parts,
-        folder=folder_of(cfg, parts, PARENT / name),
-        jobs=[
-            replace(job, swept={key: settings.get(key) for key in keys})
-            for job, settings in zip(jobs, composed, strict=True)
-        ],
-        composed=composed,
-        figures=grid.figures,
-        paper_table=grid.paper_table,
+    return Sweep(line, cfg, parts, folder_of(cfg, parts, PARENT / name), plan, composed)
+
+
+def plan_of(
+    line: Line,
+    jobs: list[Job],
+    command: Literal["sweep", "train"],
+    figures: list[str] | None,
+    paper_table: bool = False,
+) -> Plan:
+    """Return what a worker needs to run ``jobs``, before the number of their threads is known."""
+    named = {"--config-dir": line.options.config_dir, "--config-name": line.options.config_name}
+    flags = [word for flag, value in named.items() if value for word in (flag, value)]
+    return Plan(
+        cwd=str(Path.cwd()),
+        flags=flags,
+        threads=None,
+        jobs=jobs,
+        figures=figures,
+        line=[*flags, *line.words],
+        paper_table=paper_table,
+        command=command,
     )
 
 

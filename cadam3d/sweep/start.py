@@ -7,7 +7,7 @@ import os
 import shlex
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hydra.errors import HydraException
@@ -39,15 +39,12 @@ from cadam3d.settings.compose import flatten, quote, run_hydra
 from cadam3d.settings.line import NOT_OF_A_RUN, SWEEP_FOLDER
 from cadam3d.settings.trust import is_trusted, require_contained
 from cadam3d.sweep import worker
-from cadam3d.sweep.folder import Plan, Row, is_sweep, load, rows_of, write_plan
-from cadam3d.sweep.plan import Composed, Sweep, search_path
+from cadam3d.sweep.folder import Row, is_sweep, load, rows_of, write_plan
+from cadam3d.sweep.plan import Sweep, search_path
 from cadam3d.sweep.progress import reporting
 from cadam3d.sweep.table import as_text, listing, write_table
 
 LONGEST = 40  # rows of a table in the terminal
-FOLDER_FLAGS = ("--config-dir", "-cd")
-# The flags of a sweep that its jobs need too.
-JOB_FLAGS = (*FOLDER_FLAGS, "--config-name", "-cn")
 
 
 @dataclass(frozen=True)
@@ -60,24 +57,18 @@ class Ended:
     was_dry: bool = False  # nothing has run, and the folder may not exist
 
 
-def run_sweep(
-    sweep: Sweep,
-    overrides: Sequence[str],
-    flags: Sequence[str],
-    on_start: Callable[[Path], None] = lambda _: None,
-) -> Ended:
-    """Run the sweep that a line with these ``overrides`` and ``flags`` describes.
+def run_sweep(sweep: Sweep, on_start: Callable[[Path], None] = lambda _: None) -> Ended:
+    """Run a sweep until all its jobs have ended, or a signal stops it. A dry run only lists the jobs.
 
-    It ends when all jobs have ended, or when a signal stops it. A dry run only lists the jobs. ``on_start``
-    is called with the folder before the first job starts. Raises ``UserError`` if the folder has results that
-    were made with other settings.
+    ``on_start`` is called with the folder before the first job starts. Raises ``UserError`` if the folder has
+    results that were made with other settings.
     """
-    folder = sweep.folder
+    folder, plan = sweep.folder, sweep.plan
     _refuse_occupied(folder, sweep.folder_key)
-    if folder.is_dir() and not is_trusted(overrides):
-        require_contained(folder, shlex.join(["cadam3d", sweep.command, *overrides, *flags, "trust=true"]))
-    rows = rows_of(folder, sweep.jobs)
-    _refuse_other_settings(rows, sweep.composed, folder, sweep.folder_key)
+    if folder.is_dir() and not is_trusted(sweep.line.overrides):
+        require_contained(folder, shlex.join(["cadam3d", plan.command, *plan.line, "trust=true"]))
+    rows = rows_of(folder, plan.jobs)
+    _refuse_other_settings(rows, sweep)
     if sweep.is_dry:
         show(f"{_title(sweep, rows)}\n\n{listing(rows)}")
         return Ended(folder, 0, was_dry=True)
@@ -87,13 +78,14 @@ def run_sweep(
     with lock, stop:
         (folder / STOP).unlink(missing_ok=True)
         _refuse_occupied(folder, sweep.folder_key)
-        _write_plan(sweep, overrides, flags)
+        pending = sum(not row.has_result for row in rows)
+        write_plan(folder, replace(plan, threads=_threads(sweep.cfg, pending)))
         on_start(folder)
         rows, problem = load(folder), ""
         show(_title(sweep, rows))
         try:
             with reporting(rows):
-                problem = _launch(sweep, rows, flags)
+                problem = _launch(sweep, rows)
         finally:
             code = _report_results(sweep, write_table(folder), problem)
     if stop.received is not None:
@@ -115,39 +107,24 @@ def _beside(folder: Path, key: str) -> str:
     return setting_word(key, shown(numbered(folder)))
 
 
-def _refuse_other_settings(rows: Sequence[Row], composed: Sequence[Composed], folder: Path, key: str) -> None:
+def _refuse_other_settings(rows: Sequence[Row], sweep: Sweep) -> None:
     """Refuse results on disk that were made with other settings, because the table would mislabel them."""
-    for row, now in zip(rows, composed, strict=True):
+    for row, now in zip(rows, sweep.composed, strict=True):
         config = row.folder / CONFIG
         if not config.is_file() or not (row.has_result or row.has_checkpoint):
             continue
         before = dict(flatten(read_config(config)))
-        for name in sorted((before.keys() | now.values.keys()) - now.unknown - {*NOT_OF_A_RUN}):
+        for name in sorted((before.keys() | now.values.keys()) - {*NOT_OF_A_RUN}):
             if before.get(name) != now.values.get(name):
                 expected = f"{before.get(name)!r} as in {shown(row.folder)}"
-                raise fail(name, expected=expected, got=now.values.get(name), example=_beside(folder, key))
+                example = _beside(sweep.folder, sweep.folder_key)
+                raise fail(name, expected=expected, got=now.values.get(name), example=example)
 
 
 def _title(sweep: Sweep, rows: Sequence[Row]) -> str:
     """Return how many jobs a sweep has, where, and how many of them are done."""
     done = sum(row.has_result for row in rows)
     return f"{sweep.count(len(rows))} in {shown(sweep.folder)}" + (f", {done} with a result" if done else "")
-
-
-def _write_plan(sweep: Sweep, overrides: Sequence[str], flags: Sequence[str]) -> None:
-    pending = sum(not row.has_result for row in rows_of(sweep.folder, sweep.jobs))
-    of_jobs = _flags_named(flags, JOB_FLAGS)
-    plan = Plan(
-        cwd=str(Path.cwd()),
-        flags=of_jobs,
-        threads=_threads(sweep.cfg, pending),
-        jobs=sweep.jobs,
-        figures=sweep.figures,
-        line=[*of_jobs, *overrides],
-        paper_table=sweep.paper_table,
-        command=sweep.command,
-    )
-    write_plan(sweep.folder, plan)
 
 
 def _threads(cfg: DictConfig, pending: int) -> int | None:
@@ -166,24 +143,17 @@ def _threads(cfg: DictConfig, pending: int) -> int | None:
     return max(1, cores // max(1, min(at_once, pending)))
 
 
-def _flags_named(flags: Sequence[str], names: Sequence[str]) -> list[str]:
-    """Return the flags with one of these names, each with its value."""
-    kept: list[str] = []
-    for position, flag in enumerate(flags):
-        if flag.partition("=")[0] in names:
-            kept += [flag] if "=" in flag else flags[position : position + 2]
-    return kept
-
-
-def _launch(sweep: Sweep, rows: Sequence[Row], flags: Sequence[str]) -> str:
+def _launch(sweep: Sweep, rows: Sequence[Row]) -> str:
     """Run the jobs without a result with Hydra, and return what went wrong with the launcher itself."""
     numbers = ",".join(str(row.number) for row in rows if not row.has_result)
     if not numbers:
         return ""
-    overrides = [*search_path(sweep.parts.grid), *sweep.parts.launcher, f"job={numbers}"]
-    overrides += [f"{SWEEP_FOLDER}={quote(str(sweep.folder))}"]
+    words = [*search_path(sweep.parts.grid), *sweep.parts.launcher, f"job={numbers}"]
+    words += [f"{SWEEP_FOLDER}={quote(str(sweep.folder))}", "--multirun"]
+    if folder := sweep.line.options.config_dir:
+        words = ["--config-dir", folder, *words]
     try:
-        run_hydra("jobs", [*overrides, *_flags_named(flags, FOLDER_FLAGS), "--multirun"], worker.run)
+        run_hydra("jobs", words, worker.run)
     except (UserError, HydraException, KeyboardInterrupt):
         raise
     except Exception as error:

@@ -5,10 +5,11 @@ import json
 import pytest
 from harsh_prompts import HARSH
 
+from cadam3d import launch
 from cadam3d.core.errors import UserError
 from cadam3d.io.prompt_files import Prompt
 from cadam3d.report import results
-from cadam3d.settings.line import quoted, read_flags
+from cadam3d.settings.line import quoted
 from cadam3d.sweep.folder import Job, Plan, load, write_plan
 from cadam3d.sweep.grid import Grid, expand, prompt_axis, read_grid, read_line, sweep_name
 from cadam3d.sweep.plan import read_sweep
@@ -185,8 +186,7 @@ def test_every_prompt_reaches_its_job_literally_with_its_settings(tmp_path):
         {"prompt": each, "initializer_prompt": each, "negative_prompt": each} for each in [*HARSH, *LINES]
     ]
     path.write_text(json.dumps(entries))
-    line = [quoted(f"prompts={path}", is_sweep=True), "initializer=ball,shap_e"]
-    sweep = read_sweep(line, read_flags([])[0])
+    sweep = read_sweep(launch.read_line("sweep", [f"prompts={path}", "initializer=ball,shap_e"]))
     composed = sweep.composed
     wanted = [(text.strip(), name) for text in [*HARSH, *LINES] for name in ("ball", "shap_e")]
     assert [(job.get("prompt"), job.get("initializer")) for job in composed] == wanted
@@ -195,5 +195,5 @@ def test_every_prompt_reaches_its_job_literally_with_its_settings(tmp_path):
         text if name == "shap_e" else None for text, name in wanted
     ]
     # The process of a job reads its words with the same function as a line that was typed.
-    for job in sweep.jobs:
+    for job in sweep.plan.jobs:
         assert [quoted(word, is_sweep=False) for word in job.overrides] == job.overrides

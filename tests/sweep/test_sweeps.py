@@ -19,6 +19,7 @@ from cadam3d import cli
 from cadam3d.core.errors import UserError
 from cadam3d.core.signals import TOGETHER_SECONDS
 from cadam3d.io.run_folder import JOBS
+from cadam3d.launch import read_line
 from cadam3d.settings import compose as settings
 from cadam3d.settings import options
 from cadam3d.settings.line import read_flags
@@ -613,9 +614,9 @@ def test_many_jobs_that_differ_in_values_are_composed_once(sweep, monkeypatch):
     original = plan.compose
     monkeypatch.setattr(plan, "compose", lambda *args: counted.append(args) or original(*args))
     line = ["prompt='a cube'", "seed=range(0,30)", "densifier.tau_Q=0.5,0.7"]
-    found = plan.read_sweep(line, read_flags([])[0]).composed
+    found = plan.read_sweep(read_line("sweep", line)).composed
     assert [job.get("seed") for job in found] == [seed for seed in range(30) for _ in range(2)]
-    assert len(counted) == 3  # the sweep, what its plain values are, and one job
+    assert len(counted) == 2  # the sweep and one job
 
 
 def test_the_plan_records_folder_flags_and_line(sweep, tmp_path):
@@ -628,7 +629,7 @@ def test_the_plan_records_folder_flags_and_line(sweep, tmp_path):
     assert remembered.cwd == str(tmp_path)
     assert remembered.flags == ["--config-dir", "own"]
     assert remembered.line == [
-        *("--config-dir", "own", "prompt='a cube'", "densifier=mine,none", "hydra.sweep.dir='x'")
+        *("--config-dir", "own", "prompt='a cube'", "densifier=mine,none", "hydra.sweep.dir=x")
     ]
     assert [job.swept["densifier"] for job in remembered.jobs] == ["mine", "none"]
 
