@@ -37,8 +37,6 @@ LINES = [
     ((*TRAIN, "launcher=joblib"), "launcher: expected a sweep"),
     ((*TRAIN, "seed=0,1"), "cadam3d sweep seed=0,1"),
     ((*TRAIN, "exporter=ply,glb"), "exporter=[ply,glb]"),
-    ((*TRAIN, "exporter=[obj]"), "Try: 'exporter=[mesh]' exporter.mesh.format=obj"),
-    ((*TRAIN, "exporter=gif"), "Try: 'exporter=[turntable]' exporter.turntable.codec=gif"),
     (("export", "run=r", "output=torus.fbx"), "Try: for=blender"),
     (("export", "run=r", "output=torus.usdz"), "Try: for=blender"),
     ((*TRAIN, "steps=[1"), "steps: cannot read the value"),

@@ -22,7 +22,7 @@ from cadam3d.io.records import MEASUREMENTS, NUMBERS, psnr_of, read_summary, wit
 from cadam3d.io.run_folder import CONFIG, EVALUATION, LATEST, shown, typed_path
 from cadam3d.metric.base import Measurand
 from cadam3d.prior.base import DiffusionPrior
-from cadam3d.prior.truth import PriorTruth, TruthSource
+from cadam3d.prior.truth import TruthSource
 from cadam3d.settings.compose import Call
 from cadam3d.settings.trust import read_components, require_contained
 from cadam3d.sweep.folder import is_sweep, load
@@ -62,12 +62,11 @@ def evaluate(cfg: DictConfig, call: Call, folder: Path) -> dict[str, Any]:
         is_trusted=cfg.trust,
         retry=trusting(call),
     )
-    own = components_of(("prior", "rasterizer", "truth"), optional=("truth",))
+    own = components_of(("prior", "rasterizer", "truth"))
     asset = open_run(folder, cfg.device)
     device = asset.gaussians.device
     prior = component(own.prior, DiffusionPrior, "prior").to(device)
-    node = cfg.get("truth", own.get("truth"))
-    source = PriorTruth() if node is None else component(node, TruthSource, "truth")
+    source: TruthSource = component(cfg.get("truth", own.truth), TruthSource, "truth")
     truth = source.of(own.prompt, prior)
 
     def start() -> Gaussians:

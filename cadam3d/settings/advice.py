@@ -9,7 +9,6 @@ from hydra.errors import CompactHydraException, MissingConfigException, Override
 from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationResolutionError, OmegaConfBaseException
 
-from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import NO_NAME_COMPLAINT, compose, flatten, quote
 from cadam3d.settings.line import key_of
@@ -74,16 +73,8 @@ def _unknown_option(error: MissingConfigException, command: str) -> UserError:
         package = f"hydra-{option.partition('_')[0]}-launcher"
         return UserError(f"launcher: {option} is not installed. Try: pip install {package}")
     if group and (options := sorted(error.options or option_names(group))):
-        if group == "exporter" and (words := _writing(option)):
-            return fail(group, expected=f"one of {'|'.join(options)}", got=option, example=words)
         return unknown_option(group, option, options, command)
     return UserError(f"{option}: no such configuration. Try: cadam3d {command} --help")
-
-
-def _writing(kind: str) -> str:
-    from cadam3d.settings.output import writing  # slow to import
-
-    return writing(kind)
 
 
 def _no_name(reason: str, command: str, words: Sequence[str]) -> UserError:

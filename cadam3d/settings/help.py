@@ -37,7 +37,6 @@ KEY = re.compile(r"(\s*)(\w+):(?=\s|$)(.*)")
 # A group in the list of defaults, with the words about it.
 ENTRY = re.compile(r"\s*- (?:override )?/?([\w/]+): [^#]*(?:# (.*))?")
 COMMENT = re.compile(r"""(?:"[^"]*"|'[^']*'|[^#'"]|(?<=\S)#)*?(?<!\S)# ?(.*)""")
-NAME = re.compile(r"\w+")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,16 +62,15 @@ class Option:
 class Choices:
     """A group of options as a command uses it."""
 
-    name: str  # such as "camera", or "initializer/fallback" for a group inside a group
     chosen: tuple[str, ...] = ()  # the default
     words: str = "an option for the setting of this name"
 
 
+@dataclass(frozen=True)
 class Library:
     """All YAML files in some folders, in the order in which Hydra searches them."""
 
-    def __init__(self, folders: Sequence[Path]) -> None:
-        self.folders = tuple(folders)
+    folders: Sequence[Path]
 
     @cached_property
     def options(self) -> dict[str, list[str]]:
@@ -83,8 +81,8 @@ class Library:
 
     def summary(self, group: str, name: str) -> str:
         """Return the first sentence of the description of an option."""
-        about = about_of(option_file(group, name, self.folders))
-        return SENTENCE_END.split(about.partition("\n")[0], maxsplit=1)[0]
+        first = about_of(option_file(group, name, self.folders)).partition("\n")[0]
+        return SENTENCE_END.split(first, maxsplit=1)[0]
 
     def groups(self, command: str) -> dict[str, Choices]:
         """Return the groups of a command that have options, each followed by the groups inside it."""
@@ -93,9 +91,9 @@ class Library:
         groups: dict[str, Choices] = {}
         for name, value in default_options(command).items():
             chosen = value if isinstance(value, list) else [] if value is None else [value]
-            inner = {each: Choices(name=each) for each in self.options if each.startswith(f"{name}/")}
+            inner = {each: Choices() for each in self.options if each.startswith(f"{name}/")}
             if name in self.options:
-                groups |= {name: Choices(name=name, chosen=tuple(chosen), words=words[name]), **inner}
+                groups |= {name: Choices(chosen=tuple(chosen), words=words[name]), **inner}
         return groups
 
     def command(self, name: str) -> Option:
@@ -148,9 +146,9 @@ def help_text(command: str, overrides: Sequence[str], folders: Sequence[Path]) -
     for word in overrides:
         name, equals, value = word.lstrip("+").partition("=")
         if name in groups and equals:
-            parts += [_option(library, name, each) for each in NAME.findall(value) if each != "null"]
+            parts += [_option(library, name, each) for each in re.findall(r"\w+", value) if each != "null"]
         elif name in groups:
-            parts.append(_group(library, groups[name]))
+            parts.append(_group(library, name, groups[name]))
         elif name in library.options or not equals:
             line = f"cadam3d {command} --help {nearest(name, groups)}".rstrip()
             raise fail("--help", expected=f"a group of {command}", got=name, example=line)
@@ -205,10 +203,7 @@ def _defaults(content: Any) -> tuple[list[tuple[str, str]], dict[str, Any]]:
 
 
 def _settings(values: dict[str, Any], words: Mapping[str, str], prefix: str = "") -> Iterator[Setting]:
-    """Yield the settings in nested values. The numbers of a schedule are part of its value.
-
-    A group of keys is yielded only if it has a description.
-    """
+    """Yield the settings in nested values, schedules as a whole, and groups of keys with a description."""
     for name, value in values.items():
         key = f"{prefix}{name}"
         target = str(value.get(TARGET, "")) if isinstance(value, dict) else ""
@@ -234,18 +229,19 @@ def _overview(library: Library, command: str, groups: dict[str, Choices]) -> lis
     parts = [_wrapped(about.about), f"Settings (key=value):\n{_table(map(_row, about.settings))}"]
     if groups:
         intro = _wrapped("Parts (group=option, or 'group=[one,two]'). * marks what is chosen by default.")
-        parts += [intro, *(_group(library, group) for group in groups.values())]
-        example = next(f"{group.name}={group.chosen[0]}" for group in groups.values() if group.chosen)
+        parts += [intro, *(_group(library, name, group) for name, group in groups.items())]
+        example = next(f"{name}={group.chosen[0]}" for name, group in groups.items() if group.chosen)
         parts.append(_wrapped(f"More: cadam3d {command} --help {example}, or cadam3d {command} --cfg job."))
     return parts
 
 
-def _group(library: Library, group: Choices) -> str:
-    """Return the text for a group, with one line for each option."""
-    names = library.options[group.name]
-    marked = [f"* {name}" if name in group.chosen else f"  {name}" for name in names]
-    rows = zip(marked, (library.summary(group.name, name) for name in names), strict=True)
-    return f"{_wrapped(f'{group.name}: {group.words}')}\n{_table(rows)}"
+def _group(library: Library, name: str, group: Choices) -> str:
+    """Return the text for a group, with one line for each option; a star marks the default."""
+    rows = [
+        (f"{'*' if each in group.chosen else ' '} {each}", library.summary(name, each))
+        for each in library.options[name]
+    ]
+    return f"{_wrapped(f'{name}: {group.words}')}\n{_table(rows)}"
 
 
 def _option(library: Library, group: str, name: str) -> str:
@@ -267,24 +263,16 @@ def _row(setting: Setting) -> tuple[str, str]:
 
 def _table(rows: Iterable[tuple[str, str]]) -> str:
     """Return a table of two columns, the second of which is wrapped."""
-    blocks = []
+    blocks, blank = [], " " * FIRST_COLUMN
     for first, second in rows:
-        width = _width() - FIRST_COLUMN
-        text = textwrap.fill(second, width, break_long_words=False, break_on_hyphens=False)
-        text = textwrap.indent(text, " " * FIRST_COLUMN)
         fits = len(first) <= FIRST_COLUMN - 2
+        text = _wrapped(second, blank)
         blocks.append(first.ljust(FIRST_COLUMN) + text[FIRST_COLUMN:] if fits else f"{first}\n{text}")
     return "\n".join(block.rstrip() for block in blocks)
 
 
-def _wrapped(text: str) -> str:
+def _wrapped(text: str, indent: str = "") -> str:
     """Return a text in lines of the terminal, except those that begin with a space; words stay whole."""
-    return "\n".join(
-        line if line.startswith(" ") else textwrap.fill(line, _width(), break_on_hyphens=False)
-        for line in text.splitlines()
-    )
-
-
-def _width() -> int:
-    """Return the number of characters in a line."""
-    return min(max(shutil.get_terminal_size((100, 24)).columns, NARROWEST), WIDEST)
+    width = min(max(shutil.get_terminal_size((100, 24)).columns, NARROWEST), WIDEST)
+    wrapper = textwrap.TextWrapper(width, indent, indent, break_long_words=False, break_on_hyphens=False)
+    return "\n".join(line if line.startswith(" ") else wrapper.fill(line) for line in text.splitlines())

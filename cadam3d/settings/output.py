@@ -57,16 +57,6 @@ def exporting(overrides: Sequence[str], folders: Sequence[Path] = ()) -> list[st
     return [*overrides, *words]
 
 
-def writing(kind: str) -> str:
-    """Return the words that choose the exporter of files with the suffix ``.kind``; "" if there is none."""
-    classes = exporter_classes(())
-    suffix = f".{kind.lower()}"
-    for name in exporters_by_suffix(classes).get(suffix, [])[:1]:
-        setting = classes[name].suffix_setting
-        return f"'exporter=[{name}]'" + (f" exporter.{name}.{setting}={kind.lower()}" if setting else "")
-    return ""
-
-
 def exporter_classes(folders: Sequence[Path]) -> dict[str, type[Exporter]]:
     """Return the class of every option of the group ``exporter``, by its name."""
     classes = {name: option_class(GROUP, name, folders) for name in option_names(GROUP, folders)}

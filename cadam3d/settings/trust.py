@@ -17,6 +17,7 @@ import re
 import shlex
 import stat
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn
@@ -30,18 +31,16 @@ from cadam3d.core.checks import fail
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.reading import KINDS, read_text, read_yaml
-from cadam3d.io.run_folder import expanded, numbered
+from cadam3d.io.run_folder import expanded
 from cadam3d.settings.compose import escaped
 from cadam3d.settings.options import TARGET, config_dir
 
-# The last part of a key that names a folder from which this machine loads what it has computed earlier.
+# The last parts of keys that are never taken from a run: a folder from which this machine would load compiled
+# code, and an account to which the run would be sent.
 CACHE = "cache_dir"
-# The last parts of keys that are never taken from a run, and why.
-IGNORED = {CACHE: "code may be loaded from there", "entity": "the run would be sent to this account"}
+IGNORED = (CACHE, "entity")
 # Parts of keys that name models on the hub, which would be downloaded into the user's cache.
 HUB = ("ids", "revision", "model", "models", "base", "tokenizer")
-# Characters of all overrides of a run. Hydra's parser needs a second for a thousand brackets.
-LONGEST = 10_000
 # Groups that change how commands run, not what a run computes.
 MACHINERY = ("hydra", "launcher", "grid", "for")
 # Settings of a line that a later line does not repeat.
@@ -51,7 +50,9 @@ KEY = re.compile(rf"{WORD}(?:\.{WORD})*|{WORD}(?:/{WORD})+", re.ASCII)
 OPTION = re.compile(rf"{WORD}(?:[./]{WORD})*", re.ASCII)
 REFERENCE = re.compile(r"\$\{(?!hydra\b)[\w.]+\}", re.ASCII)
 INTERPOLATION = re.compile(r"(?<!\\)(?:\\\\)*\$\{")
-NAMED_TARGET = re.compile(rf"\b{TARGET}:\s*[\"']?([\w.]+)")
+# In a YAML file: the targets, and everything that may be the name of a model.
+TARGETS = rf"\b{TARGET}:\s*[\"']?([\w.]+)"
+NAMES = r"[\w./@-]+"
 # The only class of this package that a setting may name although no YAML file does.
 CONSTANT = "cadam3d.core.schedule.Constant"
 
@@ -80,60 +81,48 @@ def judge_overrides(
     could do more than change a setting.
     """
     kept = []
-    if sum(map(len, lines)) > LONGEST:
-        _refuse(path, str(lines), f"overrides of at most {LONGEST:,} characters", retry)
     for line in lines:
         try:
             override = OverridesParser.create().parse_override(line)
         # Brackets within brackets can be too deep for the parser.
-        except (HydraException, RecursionError):
-            _refuse(path, line, "key=value", retry)
-        if expected := _lacking(override, tuple(folders)):
-            _refuse(path, line, expected, retry)
+        except (HydraException, RecursionError) as error:
+            raise _refusal(path, line, "key=value", retry) from error
         key = override.key_or_group
-        if key not in given and _foreign_model(_nested(override), tuple(folders)):
-            expected = "a model that the YAML files of cadam3d name"
-            got = f"got {line[:200]!r}, which may be downloaded. To allow that, type this setting yourself"
-            raise UserError(f"{path}: expected {expected}, {got}. Try: {key}=NAME")
-        if (last := key.rpartition(".")[2]) not in IGNORED:
+        if key in given:
+            continue
+        if not _is_setting(override, tuple(folders)):
+            expected = "a setting of training with plain values, or components and models of cadam3d"
+            raise _refusal(path, line, expected, retry)
+        if key.rpartition(".")[2] in IGNORED:
+            _note_ignored(key, path)
+        else:
             kept.append(line)
-        elif key not in given:
-            _note_ignored(key, path, IGNORED[last])
     return kept
 
 
 def read_components(
-    path: Path,
-    keys: Sequence[str],
-    folders: Sequence[Path],
-    *,
-    is_trusted: bool,
-    retry: str,
-    optional: Collection[str] = (),
+    path: Path, keys: Sequence[str], folders: Sequence[Path], *, is_trusted: bool, retry: str
 ) -> DictConfig:
     """Return the prompt, the seed and the components ``keys`` of the run with the configuration ``path``.
 
-    Those of ``optional`` that the file does not have are left out. Text that looks like an interpolation
-    stays text. Raises ``UserError`` for a component that the YAML files in ``folders`` do not name, unless
-    the run is trusted.
+    Text that looks like an interpolation stays text. Raises ``UserError`` for a component that the YAML files
+    in ``folders`` do not name, unless the run is trusted.
     """
     content = read_yaml(path)
     if not isinstance(content, dict) or not isinstance(content.get("prompt"), str):
         raise UserError(f"{path}: expected the settings of a run, got no prompt. Try: another run")
-    keys = [key for key in keys if key in content or key not in optional]
     chosen = {key: content.get(key) for key in ("prompt", "seed", *keys)}
     for key in keys:
         node = chosen[key]
         if not isinstance(node, dict) or not isinstance(node.get(TARGET), str):
             raise UserError(f"{path}: {key}: expected a component, got {node!r}. Try: another run")
-        if not is_trusted:
-            if unknown := _unknown(node, tuple(folders)):
-                _refuse(path, f"{key}: {unknown}", "components that this version of cadam3d has", retry)
-            if name := _foreign_model(node, tuple(folders)):
-                _refuse(path, f"{key}: {name}", "models that the YAML files of cadam3d name", retry)
-            if node.get(CACHE) is not None:
-                _note_ignored(f"{key}.{CACHE}", path, IGNORED[CACHE])
-                node[CACHE] = None
+        if is_trusted:
+            continue
+        if foreign := _foreign(node, tuple(folders)):
+            raise _refusal(path, f"{key}: {foreign}", "components and models of cadam3d", retry)
+        if node.get(CACHE) is not None:
+            _note_ignored(f"{key}.{CACHE}", path)
+            node[CACHE] = None
     return DictConfig(escaped(chosen))
 
 
@@ -148,20 +137,20 @@ def require_contained(folder: Path, retry: str | None) -> None:
     for place, folders, files in os.walk(root, onerror=_raise_unreadable):
         for path in (Path(place, name) for name in (*folders, *files)):
             target = Path(os.path.realpath(path))
-            if retry is not None and not target.is_relative_to(root):
-                expected = f"a link to a place in {root.name}"
-                raise UserError(f"{path}: expected {expected}, got one to {target}. Try: {retry}")
-            try:
+            # A link to nothing, and a file that its process has removed, have no status.
+            kind, names = stat.S_IFREG, 1
+            with suppress(OSError):
                 status = path.stat()
-            except OSError:  # a link to nothing, or a file that its process has removed
+                kind, names = stat.S_IFMT(status.st_mode), status.st_nlink
+            if retry is not None and not target.is_relative_to(root):
+                got, example = f"a link to {target}", retry
+            elif retry is not None and kind == stat.S_IFREG and names > 1:
+                got, example = "a hard link", retry
+            elif kind in (stat.S_IFREG, stat.S_IFDIR):
                 continue
-            kind = stat.S_IFMT(status.st_mode)
-            if retry is not None and kind == stat.S_IFREG and status.st_nlink > 1:
-                copy = shlex.join(["cp", "-r", str(root), str(numbered(root))])
-                raise UserError(f"{path}: expected a file with one name, got a hard link. Try: {copy}")
-            if kind not in (stat.S_IFREG, stat.S_IFDIR):
-                got = KINDS.get(kind, "something else")
-                raise UserError(f"{path}: expected a file, got {got}. Try: rm {shlex.quote(str(path))}")
+            else:
+                got, example = KINDS.get(kind, "something else"), f"rm {shlex.quote(str(path))}"
+            raise UserError(f"{path}: expected a file inside {root.name} only, got {got}. Try: {example}")
 
 
 def _raise_unreadable(error: OSError) -> NoReturn:
@@ -169,29 +158,27 @@ def _raise_unreadable(error: OSError) -> NoReturn:
     raise fail("path", expected=expected, got=error.filename, example="another folder") from error
 
 
-def _lacking(override: Override, folders: tuple[Path, ...]) -> str:
-    """Return what an override should have been; "" if it may be repeated."""
+def _is_setting(override: Override, folders: tuple[Path, ...]) -> bool:
+    """Return whether an override only chooses options, or gives plain values to settings of training."""
     key = override.key_or_group
-    if override.is_sweep_override():
-        return "a single value"
     groups = {path.name for folder in folders for path in folder.glob("*") if path.is_dir()}
     known = groups.union(read_yaml(config_dir() / "train.yaml")) - {*MACHINERY, "defaults"}
     # With a package, as in group@package=option, the value would come to another place.
-    if not KEY.fullmatch(key) or override.package is not None or _root(key) not in known:
-        return "a setting of training"
+    is_elsewhere = override.package is not None or not KEY.fullmatch(key) or _root(key) not in known
+    if is_elsewhere or override.is_sweep_override():
+        return False
     value = override.value()
     if any((folder / key).is_dir() for folder in folders) and not override.is_delete():
         # A name cannot leave the folder of its group.
         names = value if isinstance(value, list) else [value]
         if not all(name is None or (isinstance(name, str) and OPTION.fullmatch(name)) for name in names):
-            return "the name of an option"
-    if _unknown(_nested(override), folders) or any(name in IGNORED for name, _ in _pairs(value)):
-        without = f"without {' or '.join(IGNORED)} in a value"
-        return f"plain values and components that this version of cadam3d has, {without}"
-    texts = [text for _, text in _pairs([value]) if isinstance(text, str)]
-    if any(INTERPOLATION.search(REFERENCE.sub("_", text)) for text in texts):
-        return "interpolations that only refer to other settings"
-    return ""
+            return False
+    texts = [text for _, text in _entries([value]) if isinstance(text, str)]
+    return not (
+        _foreign(_nested(override), folders)
+        or any(keys[-1] in IGNORED for keys, _ in _entries(value))
+        or any(INTERPOLATION.search(REFERENCE.sub("_", text)) for text in texts)
+    )
 
 
 def _nested(override: Override) -> Any:
@@ -208,65 +195,43 @@ def _root(line: str) -> str:
 
 
 @cache  # a sweep has many runs
-def _yaml_texts(folders: tuple[Path, ...]) -> tuple[str, ...]:
-    """Return the YAML files of all groups of components in ``folders``, as text."""
+def _named(pattern: str, folders: tuple[Path, ...]) -> set[str]:
+    """Return what matches ``pattern`` in the YAML files of all groups of components in ``folders``."""
     groups = [path.name for path in config_dir().iterdir() if path.is_dir() and path.name not in MACHINERY]
     files = [path for folder in folders for group in groups for path in (folder / group).rglob("*.yaml")]
-    return tuple(map(read_text, files))
+    return {name for path in files for name in re.findall(pattern, read_text(path))}
 
 
-@cache
-def _known_targets(folders: tuple[Path, ...]) -> frozenset[str]:
-    """Return the targets that the YAML files of all groups of components in ``folders`` name."""
-    return frozenset([CONSTANT]).union(*map(NAMED_TARGET.findall, _yaml_texts(folders)))
+def _foreign(node: Any, folders: tuple[Path, ...]) -> str:
+    """Return the first entry of plain data that builds or downloads something unknown; "" if there is none.
 
-
-def _foreign_model(node: Any, folders: tuple[Path, ...]) -> str:
-    """Return the first name of a model that neither a YAML file names nor this disk has; "" if none is."""
-    for name in _hub_names(node):
-        named = re.compile(rf"(?<![\w./@-]){re.escape(name)}(?![\w./@-])")
-        if not any(map(named.search, _yaml_texts(folders))) and not os.path.lexists(expanded(name)):
-            return name
-    return ""
-
-
-def _hub_names(node: Any, is_name: bool = False) -> Iterator[str]:
-    """Yield the texts in plain data that may name models on the hub, or versions of them."""
-    if isinstance(node, dict):
-        for key, value in node.items():
-            yield from _hub_names(value, is_name or key in HUB)
-    elif isinstance(node, list | tuple):
-        for each in node:
-            yield from _hub_names(each, is_name)
-    elif is_name and isinstance(node, str):
-        yield node
-
-
-def _unknown(node: Any, folders: tuple[Path, ...]) -> str:
-    """Return the first key or target in plain data that would build something unknown; "" if there is none.
-
-    Keys with an underscore in front, such as ``_args_``, change how Hydra builds an object.
+    Keys with an underscore in front, such as ``_args_``, change how Hydra builds an object. A model is known
+    if a YAML file names it, or if this disk has it.
     """
-    for key, value in _pairs(node):
-        if key == TARGET and isinstance(value, str) and value in _known_targets(folders):
+    for keys, value in _entries(node):
+        key, is_text = keys[-1], isinstance(value, str)
+        if key == TARGET and is_text and (value == CONSTANT or value in _named(TARGETS, folders)):
             continue
+        is_model = is_text and set(HUB).intersection(keys) and not os.path.lexists(expanded(value))
+        if is_model and value not in _named(NAMES, folders):
+            return value
         if not isinstance(key, str) or key.startswith("_"):
             return f"{key}={value}"
     return ""
 
 
-def _pairs(node: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield every key with its value in nested dicts and lists; the items of a list have the key "item"."""
+def _entries(node: Any, outer: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """Yield every value in nested dicts and lists, with the keys that lead to it; in a list, it is "item"."""
     items = [("item", each) for each in node] if isinstance(node, list | tuple) else []
     for key, value in node.items() if isinstance(node, dict) else items:
-        yield key, value
-        yield from _pairs(value)
+        yield (*outer, key), value
+        yield from _entries(value, (*outer, key))
 
 
-def _refuse(path: Path, found: str, expected: str, retry: str) -> NoReturn:
+def _refusal(path: Path, found: str, expected: str, retry: str) -> UserError:
     code = "With trust=true, all code that this folder names runs, so use it only if you trust its author."
-    raise UserError(f"{path}: expected {expected}, got {found[:200]!r}. {code} Try: {retry}")
+    return UserError(f"{path}: expected {expected}, got {found[:200]!r}. {code} Try: {retry}")
 
 
-def _note_ignored(key: str, path: Path, why: str) -> None:
-    say(f"Note: {key} in {path} is ignored, because {why}.", logging.WARNING)
+def _note_ignored(key: str, path: Path) -> None:
+    say(f"Note: {key} in {path} is ignored, because only a command line may set it.", logging.WARNING)

@@ -51,7 +51,7 @@ def test_every_setting_and_every_group_of_a_command_has_a_description(command):
     about = LIBRARY.command(command)
     assert f"\n  cadam3d {command}" in about.about
     assert not [each.key for each in about.settings if not each.words]
-    assert not [group.name for group in LIBRARY.groups(command).values() if not group.words]
+    assert not [name for name, group in LIBRARY.groups(command).items() if not group.words]
 
 
 # --- reading comments -------------------------------------------------------------------------------------
@@ -130,11 +130,11 @@ def test_the_first_of_two_folders_takes_precedence(tmp_path):
 
 def test_the_page_of_a_command_lists_every_option_with_its_description():
     text = flat(page())
-    for group in LIBRARY.groups("train").values():
-        assert f"{group.name}: {group.words}" in text
-        for name in LIBRARY.options[group.name]:
+    for group_name, group in LIBRARY.groups("train").items():
+        assert f"{group_name}: {group.words}" in text
+        for name in LIBRARY.options[group_name]:
             mark = "* " if name in group.chosen else ""
-            assert f" {mark}{name} {LIBRARY.summary(group.name, name)}".rstrip() in text
+            assert f" {mark}{name} {LIBRARY.summary(group_name, name)}".rstrip() in text
 
 
 @pytest.mark.parametrize("command", list(cli.COMMANDS))
