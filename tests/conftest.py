@@ -5,7 +5,7 @@ import os
 import pickle
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -37,6 +37,10 @@ LONG = (
     "test_cpu",
 )
 
+
+# Hydra's own files and those of the package never change.
+PACKAGE_FILES = str(Path(__file__).parents[1] / "configs")
+FIXED = ("", "structured://", "hydra.conf", "pkg://hydra.conf", PACKAGE_FILES, f"file://{PACKAGE_FILES}")
 
 # With `-m gpu`, only files with one of these words are collected: the marker, or a fixture of the folder
 # rasterizer that has a GPU among its parameters.
@@ -170,28 +174,60 @@ def _set_parents_fast() -> None:
 
 
 def _compose_once() -> None:
-    """Let Hydra compose each line once, as long as all settings come from the package, which does not change.
+    """Let Hydra compose each line once, and merge the same files once for all lines that choose them.
 
-    Every third composition of the suite repeats an earlier one.
+    Every third composition of the suite repeats an earlier one, and most others differ in plain values only.
     """
-    from hydra._internal.config_loader_impl import ConfigLoaderImpl
+    from hydra._internal import config_loader_impl as loader
 
-    from cadam3d.settings.options import config_dir
+    list_defaults = loader.create_defaults_list
+    merge = loader.ConfigLoaderImpl._compose_config_from_defaults_list
+    compose = loader.ConfigLoaderImpl.load_configuration
+    kept: dict[tuple, bytes] = {}
 
-    compose = ConfigLoaderImpl.load_configuration
-    of_package = {str(config_dir()), f"file://{config_dir()}", "pkg://hydra.conf", "structured://"}
-    composed = {}
+    def once(key: tuple, make: Callable[[], Any]) -> Any:
+        if key not in kept:
+            kept[key] = pickle.dumps(make())
+        return pickle.loads(kept[key])
+
+    def list_once(repo, config_name, overrides_list, **options):
+        values = [each for each in overrides_list if not _is_choice(each, repo)]
+        choices = [each for each in overrides_list if _is_choice(each, repo)]
+        lines = [each.input_line for each in choices]
+        key = ("list", _states(repo.get_sources()), config_name, *lines, *options.items())
+        found = once(key, lambda: list_defaults(repo, config_name, choices, **options))
+        found.config_overrides = values
+        return found
+
+    def merge_once(self, defaults, repo):
+        files = [(each.config_path, each.package, each.primary) for each in defaults]
+        return once(("merge", _states(repo.get_sources()), *files), lambda: merge(self, defaults, repo))
 
     def compose_once(self, config_name, overrides, **options):
-        sources = [source.path for source in self.get_search_path().get_path()]
-        if not of_package.issuperset(sources):
+        if any("searchpath" in line for line in overrides):
             return compose(self, config_name, overrides, **options)
-        key = (config_name, *overrides, *sorted(options.items()))
-        if key not in composed:
-            composed[key] = pickle.dumps(compose(self, config_name, overrides, **options))
-        return pickle.loads(composed[key])
+        sources = _states(self.get_search_path().get_path())
+        key = ("compose", sources, config_name, *overrides, *sorted(options.items()))
+        return once(key, lambda: compose(self, config_name, overrides, **options))
 
-    ConfigLoaderImpl.load_configuration = compose_once
+    loader.create_defaults_list = list_once
+    loader.ConfigLoaderImpl._compose_config_from_defaults_list = merge_once
+    loader.ConfigLoaderImpl.load_configuration = compose_once
+
+
+def _is_choice(override: Any, repo: Any) -> bool:
+    """Return whether an override may choose an option, as Hydra sees it."""
+    is_value = isinstance(override.value(), dict) or not repo.group_exists(override.key_or_group)
+    return override.is_sweep_override() or not is_value
+
+
+def _states(sources: Iterable[Any]) -> tuple:
+    """Return the folders in which Hydra searches, with the files of those that a test may change."""
+    states = []
+    for path in [source.path for source in sources]:
+        found = [] if path in FIXED else sorted(Path(path.removeprefix("file://")).rglob("*.yaml"))
+        states.append((path, *((str(file), file.stat().st_mtime_ns, file.stat().st_size) for file in found)))
+    return tuple(states)
 
 
 def _skip_unused_maps() -> None:
