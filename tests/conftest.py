@@ -6,7 +6,7 @@ import pickle
 import re
 import sys
 from collections.abc import Callable, Iterable
-from functools import cache
+from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -51,6 +51,9 @@ def pytest_configure(config):
     # A machine with a GPU may have few packages, and the types are checked wherever the other tests run.
     if config.option.markexpr != "gpu":
         _check_types()
+    # The tests start the program a hundred times, and each start would compile every module again.
+    sys.dont_write_bytecode = False
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     # No test cuts the power, and on some disks each call waits for milliseconds.
     os.fsync = lambda _: None
 
@@ -102,39 +105,9 @@ def pytest_collection_finish():
     # Composing a configuration makes tens of thousands of objects and hardly any cycles among them.
     gc.set_threshold(50_000, 20, 20)
     _skip_unused_maps()
-    _read_settings_once()
     _parse_once()
     _set_parents_fast()
     _compose_once()
-
-
-def _read_settings_once() -> None:
-    """Let Hydra parse each YAML file of the package, and of its own, once. Other files are read as always."""
-    from hydra._internal.sources_registry import SourcesRegistry
-    from hydra.core.plugins import Plugins
-
-    from cadam3d.settings.options import config_dir
-
-    Plugins.instance()
-    parsed = {}
-
-    def once(reader: Any, place: str) -> None:
-        load = reader.load_config
-
-        def load_once(source, config_path):
-            if source.path != place:
-                return load(source, config_path)
-            key = (place, config_path)
-            if key not in parsed:
-                parsed[key] = pickle.dumps(load(source, config_path))
-            # Hydra changes what it gets. A copy from bytes takes a fifth of the time of copy.deepcopy.
-            return pickle.loads(parsed[key])
-
-        reader.load_config = load_once
-
-    readers = SourcesRegistry.instance().types
-    once(readers["file"], str(config_dir().resolve()))
-    once(readers["pkg"], "hydra.conf")
 
 
 def _parse_once() -> None:
@@ -174,45 +147,59 @@ def _set_parents_fast() -> None:
 
 
 def _compose_once() -> None:
-    """Let Hydra compose each line once, and merge the same files once for all lines that choose them.
+    """Let Hydra read and place each file once, merge the same files once, and compose each line once.
 
     Every third composition of the suite repeats an earlier one, and most others differ in plain values only.
     """
     from hydra._internal import config_loader_impl as loader
+    from hydra._internal.config_repository import ConfigRepository
 
-    list_defaults = loader.create_defaults_list
-    merge = loader.ConfigLoaderImpl._compose_config_from_defaults_list
-    compose = loader.ConfigLoaderImpl.load_configuration
     kept: dict[tuple, bytes] = {}
+    states: dict[str, tuple] = {}
 
-    def once(key: tuple, make: Callable[[], Any]) -> Any:
-        if key not in kept:
-            kept[key] = pickle.dumps(make())
-        return pickle.loads(kept[key])
+    def once(sources: Iterable[Any], key: tuple, make: Callable[[], Any]) -> Any:
+        """Return what ``make`` has returned for the same files and the same ``key``."""
+        paths = [source.path for source in sources]
+        states.update((path, _state(path)) for path in paths if path not in states)
+        place = (*key, *(states[path] for path in paths))
+        if place not in kept:
+            kept[place] = pickle.dumps(make())
+        # Hydra changes what it gets. A copy from bytes takes a fifth of the time of copy.deepcopy.
+        return pickle.loads(kept[place])
 
-    def list_once(repo, config_name, overrides_list, **options):
+    def load_once(self, config_path):
+        return once(self.get_sources(), ("load", config_path), lambda: load(self, config_path))
+
+    def place_once(self, default, repo):
+        key = ("place", default.config_path, default.package, default.primary)
+        return once(repo.get_sources(), key, lambda: place(self, default, repo))
+
+    def list_once(repo, config_name, overrides_list, prepend_hydra, skip_missing):
         values = [each for each in overrides_list if not _is_choice(each, repo)]
         choices = [each for each in overrides_list if _is_choice(each, repo)]
-        lines = [each.input_line for each in choices]
-        key = ("list", _states(repo.get_sources()), config_name, *lines, *options.items())
-        found = once(key, lambda: list_defaults(repo, config_name, choices, **options))
+        key = ("list", config_name, skip_missing, *(each.input_line for each in choices))
+        arguments = (repo, config_name, choices, prepend_hydra, skip_missing)
+        found = once(repo.get_sources(), key, lambda: list_defaults(*arguments))
         found.config_overrides = values
         return found
 
     def merge_once(self, defaults, repo):
-        files = [(each.config_path, each.package, each.primary) for each in defaults]
-        return once(("merge", _states(repo.get_sources()), *files), lambda: merge(self, defaults, repo))
+        key = ("merge", *((each.config_path, each.package, each.primary) for each in defaults))
+        return once(repo.get_sources(), key, lambda: merge(self, defaults, repo))
 
-    def compose_once(self, config_name, overrides, **options):
+    def compose_once(self, config_name, overrides, run_mode, *arguments, **options):
+        states.clear()
+        make = partial(compose, self, config_name, overrides, run_mode, *arguments, **options)
         if any("searchpath" in line for line in overrides):
-            return compose(self, config_name, overrides, **options)
-        sources = _states(self.get_search_path().get_path())
-        key = ("compose", sources, config_name, *overrides, *sorted(options.items()))
-        return once(key, lambda: compose(self, config_name, overrides, **options))
+            return make()
+        return once(self.get_search_path().get_path(), (config_name, run_mode, *overrides), make)
 
-    loader.create_defaults_list = list_once
-    loader.ConfigLoaderImpl._compose_config_from_defaults_list = merge_once
-    loader.ConfigLoaderImpl.load_configuration = compose_once
+    load, ConfigRepository.load_config = ConfigRepository.load_config, load_once
+    list_defaults, loader.create_defaults_list = loader.create_defaults_list, list_once
+    hydra = loader.ConfigLoaderImpl
+    place, hydra._load_single_config = hydra._load_single_config, place_once
+    merge, hydra._compose_config_from_defaults_list = hydra._compose_config_from_defaults_list, merge_once
+    compose, hydra.load_configuration = hydra.load_configuration, compose_once
 
 
 def _is_choice(override: Any, repo: Any) -> bool:
@@ -221,13 +208,10 @@ def _is_choice(override: Any, repo: Any) -> bool:
     return override.is_sweep_override() or not is_value
 
 
-def _states(sources: Iterable[Any]) -> tuple:
-    """Return the folders in which Hydra searches, with the files of those that a test may change."""
-    states = []
-    for path in [source.path for source in sources]:
-        found = [] if path in FIXED else sorted(Path(path.removeprefix("file://")).rglob("*.yaml"))
-        states.append((path, *((str(file), file.stat().st_mtime_ns, file.stat().st_size) for file in found)))
-    return tuple(states)
+def _state(path: str) -> tuple:
+    """Return a folder in which Hydra searches, with its files unless no test changes them."""
+    found = [] if path in FIXED else sorted(Path(path.removeprefix("file://")).rglob("*.yaml"))
+    return (path, *((str(file), file.stat().st_mtime_ns, file.stat().st_size) for file in found))
 
 
 def _skip_unused_maps() -> None:

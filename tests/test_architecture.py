@@ -8,6 +8,7 @@ import builtins
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -48,8 +49,14 @@ SIDEWAYS = {("callback", "state"), ("launch", "commands"), ("__main__", "cli"), 
 OPEN_BELOW = {"prior": ("base", "path"), "densifier": ("base", "refine")}
 
 
+@cache
 def sources() -> list[Path]:
     return sorted(PACKAGE.rglob("*.py"))
+
+
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def part_of(path: Path) -> str:
@@ -60,7 +67,7 @@ def part_of(path: Path) -> str:
 def imports(path: Path, root: Path = PACKAGE) -> Iterator[tuple[str, list[str]]]:
     """Yield module and names of every import in a file, with relative imports made absolute."""
     package = [root.name, *path.relative_to(root).parts[:-1]]
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             yield from ((alias.name, []) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -136,12 +143,11 @@ def reachable(graph: Mapping[str, Iterable[str]], start: str) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_imports_point_down(path):
-    part = part_of(path)
-    assert part in FLOORS, f"{part} has no floor yet. Add it to FLOORS in {__file__}"
-    problems = [problem for target in own_imports(path) if (problem := arrow_problem(part, target))]
-    assert not problems
+def test_imports_point_down():
+    missing = {part_of(path) for path in sources()} - FLOORS.keys()
+    assert not missing, f"{missing} have no floor yet. Add them to FLOORS in {__file__}"
+    targets = [(path, part_of(path), target) for path in sources() for target in own_imports(path)]
+    assert not [(path, problem) for path, part, target in targets if (problem := arrow_problem(part, target))]
 
 
 @pytest.mark.parametrize(
@@ -194,27 +200,32 @@ def imports_hydra(path: Path, package: Path = PACKAGE) -> bool:
     return any(module.split(".")[0] in ("hydra", "omegaconf") for module, _ in imports(path, package))
 
 
-def private_uses(source: str) -> list[str]:
-    """Return the private modules and attributes of Hydra and OmegaConf that a source uses."""
+@cache
+def private_names() -> set[str]:
+    """Return the private attributes of Hydra's and OmegaConf's classes."""
     classes = (DictConfig, ListConfig, OmegaConf, Override, JobReturn, GlobalHydra, Singleton)
     attributes = {name for each in classes for name in (*dir(each), *getattr(each, "__annotations__", ()))}
-    private = {name for name in attributes if name.startswith("_") and not name.startswith("__")}
+    return {name for name in attributes if name.startswith("_") and not name.startswith("__")}
+
+
+def private_uses(tree: ast.Module) -> list[str]:
+    """Return the private modules and attributes of Hydra and OmegaConf that a source uses."""
+    private = private_names()
     found = []
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import | ast.ImportFrom):
             modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else [node.module]
             names = [part for module in modules if module for part in module.split(".")]
             names += [alias.name for alias in node.names]
             if names[0] in ("hydra", "omegaconf"):
                 found += [name for name in names if name.startswith("_")]
-        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) not in ("self", "cls"):
-            found += [node.attr] if node.attr in private else []
+        elif isinstance(node, ast.Attribute) and node.attr in private:
+            found += [node.attr] if ast.unparse(node.value) not in ("self", "cls") else []
     return found
 
 
-@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_only_public_parts_of_hydra_and_omegaconf_are_used(path):
-    assert not private_uses(path.read_text(encoding="utf-8"))
+def test_only_public_parts_of_hydra_and_omegaconf_are_used():
+    assert not [(path, uses) for path in sources() if (uses := private_uses(tree_of(path)))]
 
 
 @pytest.mark.parametrize(
@@ -229,7 +240,7 @@ def test_only_public_parts_of_hydra_and_omegaconf_are_used(path):
     ],
 )
 def test_a_private_part_of_hydra_is_noticed(line):
-    assert private_uses(line)
+    assert private_uses(ast.parse(line))
 
 
 def test_core_imports_only_array_packages_and_the_standard_library():
@@ -254,12 +265,11 @@ DRAWS_IN_PLACE |= {"trunc_normal_", "uniform_"}
 OWN_STATE = {"SeedSequence", "Generator", "PCG64", "Philox", "default_rng", "Random", "SystemRandom"}
 
 
-def global_draws(source: str) -> list[str]:
-    """Return the calls in ``source`` that read or change the random state of the process.
+def global_draws(tree: ast.Module) -> list[str]:
+    """Return the calls of a source that read or change the random state of the process.
 
     Calls inside ``with torch.random.fork_rng(...)`` are left out, because that state is restored.
     """
-    tree = ast.parse(source)
     full_names = {}  # local name -> what was imported
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -298,9 +308,8 @@ def _is_global_draw(call: ast.Call, name: str) -> bool:
             return last in DRAWS_IN_PLACE and not has_generator
 
 
-@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_all_randomness_comes_from_a_generator_argument(path):
-    assert not global_draws(path.read_text(encoding="utf-8"))
+def test_all_randomness_comes_from_a_generator_argument():
+    assert not [(path, draws) for path in sources() if (draws := global_draws(tree_of(path)))]
 
 
 @pytest.mark.parametrize(
@@ -321,7 +330,7 @@ def test_all_randomness_comes_from_a_generator_argument(path):
     ],
 )
 def test_a_draw_from_the_global_state_is_noticed(line):
-    assert len(global_draws(line)) == 1
+    assert len(global_draws(ast.parse(line))) == 1
 
 
 @pytest.mark.parametrize(
@@ -337,13 +346,13 @@ def test_a_draw_from_the_global_state_is_noticed(line):
     ],
 )
 def test_a_draw_from_an_explicit_generator_is_allowed(line):
-    assert not global_draws(line)
+    assert not global_draws(ast.parse(line))
 
 
 def test_no_class_is_defined_twice():
     places: dict[str, list[str]] = {}
     for path in sources():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 places.setdefault(node.name, []).append(str(path.relative_to(PACKAGE)))
     assert not {name: where for name, where in places.items() if len(where) > 1}
@@ -371,7 +380,7 @@ def test_the_class_of_a_component_is_never_checked():
     interfaces += ("Exporter", "Metric", "Callback", "Background", "Regularizer", "Augmentation", "Exposure")
     guilty = []
     for path in sources():
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(tree_of(path)):
             is_check = isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
             if is_check and node.func.id in ("isinstance", "issubclass") and len(node.args) == 2:
                 checked = {name.id for name in ast.walk(node.args[1]) if isinstance(name, ast.Name)}
@@ -389,20 +398,20 @@ FILE_NAMES = {
 }
 
 
-@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_only_one_module_spells_the_names_of_files_in_a_run_folder(path):
+def test_only_one_module_spells_the_names_of_files_in_a_run_folder():
     """Names of folders such as ``images`` are not checked, because they are ordinary words."""
-    if path == Path(run_folder.__file__):
-        return
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    spelled = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
-    assert not spelled & FILE_NAMES
+    nodes = [(path, node) for path in sources() for node in ast.walk(tree_of(path))]
+    spelled = [(path, node.value) for path, node in nodes if isinstance(node, ast.Constant)]
+    assert {path for path, value in spelled if value in FILE_NAMES} == {Path(run_folder.__file__)}
 
 
-@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_every_name_is_defined(path):
+def test_every_name_is_defined():
     """The linter cannot check this, because the shapes in type hints look like undefined names."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    assert not [(path, names) for path in sources() if (names := undefined_names(tree_of(path)))]
+
+
+def undefined_names(tree: ast.Module) -> set[str]:
+    """Return the names that a source uses and nowhere defines."""
     known = {*vars(builtins), "__file__"}
     for node in ast.walk(tree):
         match node:
@@ -421,4 +430,4 @@ def test_every_name_is_defined(path):
             ):
                 known.add(name)
     used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
-    assert not used - known
+    return used - known

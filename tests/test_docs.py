@@ -165,9 +165,9 @@ def without_missing_launcher(words: list[str]) -> list[str]:
 
 
 def some_jobs(*arguments: Any) -> list[Job]:
-    """Return about ten jobs of a sweep. The tests of the settings compose every arm of every grid."""
+    """Return two jobs of a sweep. The tests of the settings compose every arm of every grid."""
     jobs = expand(*arguments)
-    return jobs[:: max(1, len(jobs) // 10)]
+    return [jobs[0], *jobs[1:][-1:]]
 
 
 @pytest.mark.parametrize("line", DISTINCT, ids=str)
