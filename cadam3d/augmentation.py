@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require_range
+from cadam3d.core.checks import Declared, Share
 from cadam3d.core.device import upload
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderOutput
@@ -17,7 +17,7 @@ LEAST = 1e-3
 LARGEST_SEED = 2**63 - 1
 
 
-class Augmentation(ABC):
+class Augmentation(Declared, ABC):
     """Two differentiable changes: to the Gaussians of a training step, and to its images.
 
     Holds frozen hyper-parameters; all randomness comes from the generator.
@@ -57,14 +57,9 @@ class LucidAugmentation(Augmentation):
     left from right, a mirrored image is wrong.
     """
 
-    scale_noise: float  # standard deviation
-    disparity: float  # probability
-    flip: float  # probability
-
-    def __post_init__(self) -> None:
-        require_range("augmentation.scale_noise", self.scale_noise, low=0, high=1)
-        require_range("augmentation.disparity", self.disparity, low=0, high=1)
-        require_range("augmentation.flip", self.flip, low=0, high=1)
+    scale_noise: Share  # standard deviation
+    disparity: Share  # probability
+    flip: Share  # probability
 
     def perturb(self, gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
         """Return the same Gaussians with ``scales * max(1 + scale_noise * N(0, 1), 0.001)``."""

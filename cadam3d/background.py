@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require_choice, require_color, require_range
+from cadam3d.core.checks import Color, Declared, Share
 
 
-class Background(ABC):
+class Background(Declared, ABC):
     """Draws one colour per training view. Holds frozen hyper-parameters."""
 
     @abstractmethod
@@ -23,10 +23,7 @@ class Background(ABC):
 class ConstantBackground(Background):
     """The same colour behind every view."""
 
-    color: Sequence[float]  # RGB in [0, 1]
-
-    def __post_init__(self) -> None:
-        require_color("background.color", self.color)
+    color: Color
 
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
         """Return the colour, repeated for every view."""
@@ -40,14 +37,9 @@ class RandomBackground(Background):
     With ``shared``, all views of a step have the same colour, as a model of several views has seen them.
     """
 
-    probability: float  # in [0, 1]
-    color: Sequence[float]  # RGB in [0, 1]
+    probability: Share
+    color: Color
     shared: bool
-
-    def __post_init__(self) -> None:
-        require_range("background.probability", self.probability, low=0, high=1)
-        require_color("background.color", self.color)
-        require_choice("background.shared", self.shared, (True, False))
 
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
         """Return one colour per view; the number of random draws does not depend on their outcome."""
@@ -61,14 +53,9 @@ class RandomBackground(Background):
 class LucidBackground(Background):
     """Black, a random colour or the constant one, drawn for each view (LucidDreamer)."""
 
-    probability: float  # in [0, 1]
-    black: float  # share, in [0, 1]
-    color: Sequence[float]  # RGB in [0, 1]
-
-    def __post_init__(self) -> None:
-        require_range("background.probability", self.probability, low=0, high=1)
-        require_range("background.black", self.black, low=0, high=1)
-        require_color("background.color", self.color)
+    probability: Share
+    black: Share
+    color: Color
 
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
         """Return one colour per view; the number of random draws does not depend on their outcome."""
@@ -82,10 +69,7 @@ class LucidBackground(Background):
 class BlackOrWhite(Background):
     """White with probability ``white`` and otherwise black, drawn for each view (DreamGaussian)."""
 
-    white: float  # in [0, 1]
-
-    def __post_init__(self) -> None:
-        require_range("background.white", self.white, low=0, high=1)
+    white: Share
 
     def sample(self, views: int, generator: torch.Generator) -> Float[Tensor, "v 3"]:
         """Return black or white for each view."""

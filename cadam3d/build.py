@@ -193,10 +193,12 @@ def _typed_place(node: DictConfig, key: str, where: str) -> str:
 def _placed(error: UserError, where: str) -> UserError:
     """Return the error of a constructor with the place of its node, which the constructor cannot know.
 
-    A schedule, for example, writes ``schedule.steps``, which is ``optimizer.means_lr.steps`` here.
+    A schedule, for example, writes ``Linear.steps``, which is ``optimizer.means_lr.steps`` here.
     """
     text = str(error)
-    if not (named := re.match(r"([\w.*]+)\.\w+: ", text)) or f"{named.group(1)}.".startswith(f"{where}."):
+    if not (named := re.match(r"([A-Z]\w*|[\w.]+)\.[\w.]+: ", text)) or f"{named.group(1)}.".startswith(
+        f"{where}."
+    ):
         return error
     inside, place = f"{named.group(1)}.", f"{where}."
     return UserError(text.replace(inside, place), key=error.key.replace(inside, place))

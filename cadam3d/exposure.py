@@ -2,16 +2,17 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_range, require_whole
+from cadam3d.core.checks import AtLeastZero, Declared, Share, Whole, require, within
 from cadam3d.core.rendering import RenderOutput
 
 
-class Exposure(ABC):
+class Exposure(Declared, ABC):
     """Checks the brightness of a step's renders. Holds frozen hyper-parameters; uses no random numbers."""
 
     @abstractmethod
@@ -43,15 +44,14 @@ class BrightnessGuard(Exposure):
     so that a random colour decides whether the object is dimmed. Here it has no influence.
     """
 
-    begin: int  # step
-    end: int  # step
-    quantile: float  # in [0, 1]
-    threshold: float  # brightness
-    rate: float  # in (0, 1)
+    begin: Whole  # step
+    end: Whole  # step
+    quantile: Share
+    threshold: AtLeastZero  # brightness
+    rate: Annotated[float, within(above=0, below=1)]
 
     def __post_init__(self) -> None:
-        require_whole("exposure.begin", self.begin, low=0)
-        require_whole("exposure.end", self.end, low=0)
+        super().__post_init__()
         require(
             self.end > self.begin,
             "exposure.end",
@@ -59,9 +59,6 @@ class BrightnessGuard(Exposure):
             got=self.end,
             example=f"exposure.end={self.begin + 3500}",
         )
-        require_range("exposure.quantile", self.quantile, low=0, high=1)
-        require_range("exposure.threshold", self.threshold, low=0)
-        require_range("exposure.rate", self.rate, above=0, below=1)
 
     @torch.no_grad()
     def dimming(

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cadam3d.core.checks import require_range, unless_none
+from cadam3d.core.checks import AtLeastZero, BelowOne, Declared, Positive
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import FIELDS, Gaussians
-from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+from cadam3d.core.schedule import Schedule, as_schedule
 
 # The tensors as Adam groups them: view-dependent colours are separate, because they learn more slowly.
 PARTS = ("means", "sh_dc", "sh_rest", "opacity", "scale", "quat")
@@ -23,29 +23,20 @@ FUSED = ("cuda",)
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdamSettings:
+class AdamSettings(Declared):
     """Learning rates (a number, or a schedule of the step) and constants of Adam (Kingma and Ba 2015)."""
 
-    means_lr: float | Schedule  # >= 0, world units per step
-    sh_dc_lr: float | Schedule  # >= 0
-    sh_rest_lr: float | Schedule  # >= 0
-    opacity_lr: float | Schedule  # >= 0, logits per step
-    scale_lr: float | Schedule  # >= 0, natural logs per step
-    quat_lr: float | Schedule  # >= 0
-    beta1: float  # in [0, 1)
-    beta2: float  # in [0, 1)
-    eps: float  # > 0
-    clip_norm: float | Schedule | None  # > 0, of each part
-    clip_unit: float  # > 0, world units
-
-    def __post_init__(self) -> None:
-        for part in PARTS:
-            require_scheduled(f"optimizer.{part}_lr", getattr(self, f"{part}_lr"), low=0)
-        require_range("optimizer.beta1", self.beta1, low=0, below=1)
-        require_range("optimizer.beta2", self.beta2, low=0, below=1)
-        require_range("optimizer.eps", self.eps, above=0)
-        unless_none(require_scheduled, "optimizer.clip_norm", self.clip_norm, above=0)
-        require_range("optimizer.clip_unit", self.clip_unit, above=0)
+    means_lr: AtLeastZero | Schedule  # world units per step
+    sh_dc_lr: AtLeastZero | Schedule
+    sh_rest_lr: AtLeastZero | Schedule
+    opacity_lr: AtLeastZero | Schedule  # logits per step
+    scale_lr: AtLeastZero | Schedule  # natural logs per step
+    quat_lr: AtLeastZero | Schedule
+    beta1: BelowOne
+    beta2: BelowOne
+    eps: Positive
+    clip_norm: Positive | Schedule | None  # of each part
+    clip_unit: Positive  # world units
 
     def start(self, gaussians: Gaussians) -> "GaussianOptimizer":
         """Return an optimizer that owns a copy of ``gaussians``, with zero moments."""

@@ -6,16 +6,16 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require_range
+from cadam3d.core.checks import AtLeastZero, Declared, Positive
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderOutput
-from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+from cadam3d.core.schedule import Schedule, as_schedule
 
 # Distance of alpha from 0 and 1 that keeps logarithms finite in transparent and in opaque pixels.
 CLEAR = 1e-5
 
 
-class Regularizer(ABC):
+class Regularizer(Declared, ABC):
     """A penalty on properties that the prior does not control. Holds frozen hyper-parameters."""
 
     @abstractmethod
@@ -27,10 +27,7 @@ class Regularizer(ABC):
 class Weighted(Regularizer):
     """A penalty times a weight that may follow a schedule."""
 
-    weight: float | Schedule
-
-    def __post_init__(self) -> None:
-        require_scheduled("regularizer.*.weight", self.weight, low=0)
+    weight: AtLeastZero | Schedule
 
     def __call__(self, gaussians: Gaussians, output: RenderOutput, step: int) -> Float[Tensor, ""]:
         """Return ``weight(step)`` times :meth:`penalty`."""
@@ -69,11 +66,7 @@ class MeanOpacity(Weighted):
 class OutsideBall(Weighted):
     """Mean squared distance of the centres to the ball that must hold the object; zero inside it."""
 
-    radius: float  # world units
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_range("regularizer.*.radius", self.radius, above=0)
+    radius: Positive  # world units
 
     def penalty(self, gaussians: Gaussians, output: RenderOutput) -> Float[Tensor, ""]:
         """Return the mean over Gaussians of ``max(|mean| - radius, 0)^2``, in world units squared."""

@@ -3,21 +3,24 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
 
 import torch
 
 from cadam3d.camera.base import CameraSampler
 from cadam3d.camera.ranges import (
+    Elevations,
+    Law,
+    Lenses,
+    Size,
     elevations,
     image_size,
-    require_elevations,
     require_interval,
-    require_size,
     uniform,
 )
 from cadam3d.core.cameras import Cameras, orbit
 from cadam3d.core.checks import require
-from cadam3d.core.schedule import Schedule
 
 # Multi-view networks were trained on groups of this size.
 GROUP = 4  # views
@@ -33,17 +36,15 @@ class Multiview(CameraSampler):
     starting at a random angle in the first quarter. Consecutive views form a group: 0 to 3, 4 to 7, etc.
     """
 
-    size: int | Schedule  # pixels
-    elevation_deg: Sequence[float]
-    elevation_law: str  # one of ELEVATION_LAWS
-    relative_distance: Sequence[float]  # world units
-    fov_y_deg: Sequence[float]
+    size: Size  # pixels
+    elevation_deg: Elevations
+    elevation_law: Law
+    # World units.
+    relative_distance: Annotated[Sequence[float], partial(require_interval, low=0, high=100)]
+    fov_y_deg: Lenses
 
     def __post_init__(self) -> None:
-        require_size(self.size)
-        require_elevations(self.elevation_law, self.elevation_deg)
-        require_interval("camera.relative_distance", self.relative_distance, low=0, high=100)
-        require_interval("camera.fov_y_deg", self.fov_y_deg, low=1, high=170)
+        super().__post_init__()
         least = OUTSIDE * math.tan(math.radians(self.fov_y_deg[1]) / 2)
         require(
             self.relative_distance[0] >= least,

@@ -1,22 +1,22 @@
 """Orbit: cameras around the object within chosen ranges, spread evenly in azimuth over a step's views."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 
 from cadam3d.camera.base import CameraSampler
 from cadam3d.camera.ranges import (
+    Azimuths,
+    Distances,
+    Elevations,
+    Law,
+    Lenses,
+    Size,
     elevations,
     image_size,
-    require_elevations,
-    require_interval,
-    require_lens,
-    require_size,
     uniform,
 )
 from cadam3d.core.cameras import Cameras, orbit
-from cadam3d.core.schedule import Schedule
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,18 +27,12 @@ class Orbit(CameraSampler):
     a step never shows the object from one side only.
     """
 
-    size: int | Schedule  # pixels
-    azimuth_deg: Sequence[float]
-    elevation_deg: Sequence[float]
-    elevation_law: str  # one of ELEVATION_LAWS
-    distance: Sequence[float]  # world units
-    fov_y_deg: Sequence[float]
-
-    def __post_init__(self) -> None:
-        require_size(self.size)
-        require_interval("camera.azimuth_deg", self.azimuth_deg, low=-360, high=360)
-        require_elevations(self.elevation_law, self.elevation_deg)
-        require_lens(self.distance, self.fov_y_deg)
+    size: Size  # pixels
+    azimuth_deg: Azimuths
+    elevation_deg: Elevations
+    elevation_law: Law
+    distance: Distances  # world units
+    fov_y_deg: Lenses
 
     def sample(self, step: int, views: int, generator: torch.Generator) -> Cameras:
         """Draw one camera per stratum of azimuth, and everything else independently for each camera.

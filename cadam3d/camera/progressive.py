@@ -3,16 +3,17 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.camera.base import CameraSampler
-from cadam3d.camera.ranges import image_size, require_interval, require_lens, require_size, uniform
+from cadam3d.camera.ranges import Size, image_size, require_interval, uniform
 from cadam3d.core.cameras import Cameras, around, look_at, pinhole, wrapped
-from cadam3d.core.checks import are_numbers, require, require_range, require_whole
-from cadam3d.core.schedule import Schedule
+from cadam3d.core.checks import Count, Positive, Share, Whole, are_numbers, require, within
 
 # Logarithm of the largest growth of a range. It stays within floating point, and every range has reached
 # its end long before.
@@ -42,6 +43,15 @@ class Widening:
         return min(max(self.about + (start - self.about) * growth, min(start, rest)), max(start, rest))
 
 
+def require_widening(key: str, widening: Widening, *, low: float, high: float) -> None:
+    """Raise ``UserError`` unless both ranges are in ``[low, high]``, and the factors can be used."""
+    require_interval(f"{key}.start", widening.start, low=low, high=high)
+    require_interval(f"{key}.end", widening.end, low=low, high=high)
+    is_pair = are_numbers(widening.factor, low=1e-3, high=1e3) and len(widening.factor) == 2
+    expected = "two numbers in [0.001, 1000]"
+    require(is_pair, f"{key}.factor", expected=expected, got=widening.factor)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Progressive(CameraSampler):
     """Slightly shaken cameras around the origin, with ranges that widen at multiples of ``every``.
@@ -56,35 +66,18 @@ class Progressive(CameraSampler):
     also shears the image slightly; the cameras here stay rigid.
     """
 
-    size: int | Schedule  # pixels
-    azimuth_deg: Widening
-    elevation_deg: Widening
-    distance: Widening  # world units
-    fov_y_deg: Widening
-    begin: int  # step
-    every: int  # steps
-    gamma: float  # exponent
-    position_jitter: float  # world units
-    target_jitter: float  # world units
-    up_jitter: float  # standard deviation
-
-    def __post_init__(self) -> None:
-        require_size(self.size)
-        for side in ("start", "end"):
-            turn, rise = getattr(self.azimuth_deg, side), getattr(self.elevation_deg, side)
-            require_interval(f"camera.azimuth_deg.{side}", turn, low=-360, high=360)
-            require_interval(f"camera.elevation_deg.{side}", rise, low=-90, high=90)
-            require_lens(getattr(self.distance, side), getattr(self.fov_y_deg, side), f".{side}")
-        for name in ("azimuth_deg", "elevation_deg", "distance", "fov_y_deg"):
-            factor = getattr(self, name).factor
-            is_pair = are_numbers(factor, low=1e-3, high=1e3) and len(factor) == 2
-            require(is_pair, f"camera.{name}.factor", expected="two numbers in [0.001, 1000]", got=factor)
-        require_whole("camera.begin", self.begin, low=0)
-        require_whole("camera.every", self.every, low=1)
-        require_range("camera.gamma", self.gamma, above=0)
-        require_range("camera.position_jitter", self.position_jitter, low=0, high=0.5)
-        require_range("camera.target_jitter", self.target_jitter, low=0, high=1)
-        require_range("camera.up_jitter", self.up_jitter, low=0, high=1)
+    size: Size  # pixels
+    azimuth_deg: Annotated[Widening, partial(require_widening, low=-360, high=360)]
+    elevation_deg: Annotated[Widening, partial(require_widening, low=-90, high=90)]
+    # World units; outside the unit ball, which the object may fill.
+    distance: Annotated[Widening, partial(require_widening, low=1, high=1000)]
+    fov_y_deg: Annotated[Widening, partial(require_widening, low=1, high=170)]
+    begin: Whole  # step
+    every: Count  # steps
+    gamma: Positive  # exponent
+    position_jitter: Annotated[float, within(low=0, high=0.5)]  # world units
+    target_jitter: Share  # world units
+    up_jitter: Share  # standard deviation
 
     def widenings(self, step: int) -> int:
         """Return how often the ranges have widened at ``step``, where 0 is the first step."""

@@ -1,14 +1,16 @@
 """Ranges: how every sampler draws from ``[low, high]``, and the checks of such ranges."""
 
 from collections.abc import Sequence
+from functools import partial
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import are_numbers, require, require_choice, require_whole
+from cadam3d.core.checks import are_numbers, one_of, require, within
 from cadam3d.core.pictures import MOST_PIXELS
-from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+from cadam3d.core.schedule import Schedule, as_schedule
 
 ELEVATION_LAWS = ("uniform", "sphere", "mixture")
 
@@ -45,37 +47,19 @@ def image_size(size: int | Schedule, step: int) -> int:
     return round(as_schedule(size)(step))
 
 
-def require_size(size: int | Schedule) -> None:
-    """Raise ``UserError`` unless ``size`` is a schedule or a whole number of pixels."""
-    if isinstance(size, Schedule):
-        require_scheduled("camera.size", size, low=1)
-    else:
-        require_whole("camera.size", size, low=1, high=MOST_PIXELS)
-
-
 def require_interval(key: str, interval: object, *, low: float, high: float) -> None:
     """Raise ``UserError`` unless ``interval`` is two ascending numbers in ``[low, high]``."""
     is_interval = (
         are_numbers(interval, low=low, high=high) and len(interval) == 2 and interval[0] <= interval[1]
     )
-    require(
-        is_interval,
-        key,
-        expected=f"[low, high] in ascending order between {low:g} and {high:g}",
-        got=interval,
-    )
+    expected = f"[low, high] in ascending order between {low:g} and {high:g}"
+    require(is_interval, key, expected=expected, got=interval)
 
 
-def require_elevations(law: object, interval: object) -> None:
-    """Raise ``UserError`` unless ``law`` is known and ``interval`` is two ascending elevations in degrees."""
-    require_choice("camera.elevation_law", law, ELEVATION_LAWS)
-    require_interval("camera.elevation_deg", interval, low=-90, high=90)
-
-
-def require_lens(distance: object, fov_y_deg: object, suffix: str = "") -> None:
-    """Raise ``UserError`` unless distances are outside the unit ball and fields of view are in [1, 170].
-
-    ``suffix`` is appended to the names of the keys in the message, such as ``.start``.
-    """
-    require_interval(f"camera.distance{suffix}", distance, low=1, high=1000)
-    require_interval(f"camera.fov_y_deg{suffix}", fov_y_deg, low=1, high=170)
+Size = Annotated[int | Schedule, within(low=1, high=MOST_PIXELS)]
+Azimuths = Annotated[Sequence[float], partial(require_interval, low=-360, high=360)]
+Elevations = Annotated[Sequence[float], partial(require_interval, low=-90, high=90)]
+# Outside the unit ball, which the object may fill.
+Distances = Annotated[Sequence[float], partial(require_interval, low=1, high=1000)]
+Lenses = Annotated[Sequence[float], partial(require_interval, low=1, high=170)]
+Law = Annotated[str, one_of(ELEVATION_LAWS)]

@@ -1,14 +1,12 @@
 """Sphere: cameras from all directions, above and below alike."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 
 from cadam3d.camera.base import CameraSampler
-from cadam3d.camera.ranges import image_size, require_lens, require_size, uniform
+from cadam3d.camera.ranges import Distances, Lenses, Size, image_size, uniform
 from cadam3d.core.cameras import Cameras, orbit
-from cadam3d.core.schedule import Schedule
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,13 +17,9 @@ class Sphere(CameraSampler):
     (see :class:`~cadam3d.camera.orbit.Orbit`).
     """
 
-    size: int | Schedule  # pixels
-    distance: Sequence[float]  # [low, high], world units
-    fov_y_deg: Sequence[float]  # [low, high]
-
-    def __post_init__(self) -> None:
-        require_size(self.size)
-        require_lens(self.distance, self.fov_y_deg)
+    size: Size  # pixels
+    distance: Distances  # [low, high], world units
+    fov_y_deg: Lenses  # [low, high]
 
     def sample(self, step: int, views: int, generator: torch.Generator) -> Cameras:
         """Draw directions such that equal areas are equally likely.

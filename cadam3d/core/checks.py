@@ -1,9 +1,14 @@
-"""Checks of settings; their errors name the key, what was expected, what came, and what to type."""
+"""Checks of settings; their errors name the key, what was expected, what came, and what to type.
+
+A component declares what its fields may be: ``beta1: BelowOne``, or ``cap: Annotated[int, whole(low=1)]``.
+"""
 
 import difflib
 import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import TypeGuard
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from functools import cache, partial
+from types import NoneType
+from typing import Annotated, Any, TypeGuard, get_args, get_type_hints
 
 from cadam3d.core.errors import UserError
 
@@ -69,7 +74,7 @@ def unless_none(check: Callable[..., None], key: str, value: object, **bounds: o
         check(key, value, **bounds)
 
 
-def require_choice(key: str, value: object, choices: Sequence[object]) -> None:
+def require_choice(key: str, value: object, choices: Collection[object]) -> None:
     """Raise unless ``value`` is one of ``choices``, of the same type.
 
     The message lists the choices. It suggests the nearest one, or the first one if none is near.
@@ -102,3 +107,68 @@ def are_numbers(value: object, *, low: float, high: float) -> TypeGuard[Sequence
     return isinstance(value, Sequence) and all(
         isinstance(item, int | float) and not isinstance(item, bool) and low <= item <= high for item in value
     )
+
+
+Check = partial[None]  # of a function that raises UserError for a key and its value
+
+
+def within(**bounds: float) -> Check:
+    """Return the check of a number, with the bounds of :func:`require_range`."""
+    return partial(require_range, **bounds)
+
+
+def whole(**bounds: float) -> Check:
+    """Return the check of a whole number, with the bounds of :func:`require_whole`."""
+    return partial(require_whole, **bounds)
+
+
+def one_of(choices: Collection[object]) -> Check:
+    """Return the check that a value is one of ``choices``."""
+    return partial(require_choice, choices=choices)
+
+
+Positive = Annotated[float, within(above=0)]
+AtLeastZero = Annotated[float, within(low=0)]
+Share = Annotated[float, within(low=0, high=1)]
+BelowOne = Annotated[float, within(low=0, below=1)]
+Elevation = Annotated[float, within(low=-90, high=90)]  # degrees
+Count = Annotated[int, whole(low=1)]
+Whole = Annotated[int, whole(low=0)]
+Color = Annotated[Sequence[float], partial(require_color)]  # RGB in [0, 1]
+
+
+class Declared:
+    """Base of components, dataclasses whose annotations declare what their fields may be.
+
+    What holds for a number holds for the values of a schedule too. A field may be None if its type has None.
+    """
+
+    def __post_init__(self) -> None:
+        """Raise ``UserError`` for a field that is not what its annotation declares.
+
+        The message names the class. The component that is built from a configuration has a place in it.
+        """
+        for name, (checks, is_optional) in declared(type(self)).items():
+            value = getattr(self, name)
+            values = () if value is None and is_optional else getattr(value, "extremes", (value,))
+            for check in checks:
+                for each in values:
+                    check(f"{type(self).__name__}.{name}", each)
+
+
+@cache
+def declared(cls: type) -> dict[str, tuple[tuple[Check, ...], bool]]:
+    """Return the checks of each annotated field of a class, and whether the field may be None."""
+    found: dict[str, tuple[tuple[Check, ...], bool]] = {}
+    for name, hint in get_type_hints(cls, include_extras=True).items():
+        parts = list(_parts(hint))
+        if checks := tuple(part for part in parts if isinstance(part, partial)):
+            found[name] = checks, NoneType in parts
+    return found
+
+
+def _parts(hint: Any) -> Iterator[Any]:
+    """Yield the types and the metadata inside a type, at any depth."""
+    yield hint
+    for part in (*get_args(hint), *getattr(hint, "__metadata__", ())):
+        yield from _parts(part)

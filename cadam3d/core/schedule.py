@@ -8,15 +8,21 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
-from cadam3d.core.checks import are_numbers, require, require_range, require_whole
+from cadam3d.core.checks import Count, Declared, Positive, are_numbers, require, whole, within
 
 # A step at which every schedule has its final value.
 FAR_STEP = 10**9
 
 
-class Schedule(ABC):
+class Schedule(Declared, ABC):
     """A number that depends on the optimization step (0 is the first step)."""
+
+    @property
+    def extremes(self) -> Sequence[float]:
+        """Return values that include the smallest and the largest: here, the first and the last."""
+        return self(0), self(FAR_STEP)
 
     @abstractmethod
     def __call__(self, step: int) -> float:
@@ -27,10 +33,7 @@ class Schedule(ABC):
 class Constant(Schedule):
     """The same value at every step."""
 
-    value: float
-
-    def __post_init__(self) -> None:
-        require_range("schedule.value", self.value)
+    value: Annotated[float, within()]
 
     def __call__(self, step: int) -> float:
         """Return the value, whatever the step."""
@@ -41,16 +44,10 @@ class Constant(Schedule):
 class _Ramp(Schedule):
     """From ``start`` at step ``begin`` to ``end`` at ``steps`` steps later, and constant before and after."""
 
-    start: float
-    end: float
-    steps: int
-    begin: int = 0
-
-    def __post_init__(self) -> None:
-        require_whole("schedule.steps", self.steps, low=1)
-        require_whole("schedule.begin", self.begin)
-        require_range("schedule.start", self.start)
-        require_range("schedule.end", self.end)
+    start: Annotated[float, within()]
+    end: Annotated[float, within()]
+    steps: Count
+    begin: Annotated[int, whole()] = 0
 
     def _progress(self, step: int) -> float:
         """Return the share of the way that is done at ``step``, in [0, 1]."""
@@ -70,10 +67,8 @@ class Linear(_Ramp):
 class LogLinear(_Ramp):
     """Like :class:`Linear`, but in the logarithm: equal factors over equal times, as for 3DGS' rates."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_range("schedule.start", self.start, above=0)
-        require_range("schedule.end", self.end, above=0)
+    start: Positive
+    end: Positive
 
     def __call__(self, step: int) -> float:
         """Return the value at ``step``."""
@@ -94,11 +89,15 @@ class Steps(Schedule):
             and are_numbers(self.milestones, low=-FAR_STEP, high=FAR_STEP)
             and len(self.values) == len(self.milestones) + 1
             and list(self.milestones) == sorted(self.milestones),
-            "schedule.values",
+            "Steps.values",
             expected="one value more than milestones, all numbers, milestones ascending",
             got=(self.values, self.milestones),
-            example="'schedule.values=[0.98,0.5]' 'schedule.milestones=[500]'",
         )
+
+    @property
+    def extremes(self) -> Sequence[float]:
+        """Return all values."""
+        return self.values
 
     def __call__(self, step: int) -> float:
         """Return the value at ``step``."""
@@ -108,18 +107,3 @@ class Steps(Schedule):
 def as_schedule(value: float | Schedule) -> Schedule:
     """Return ``value`` as a schedule; a plain number becomes a constant one."""
     return value if isinstance(value, Schedule) else Constant(float(value))
-
-
-def require_scheduled(key: str, value: object, **bounds: float) -> None:
-    """Raise unless ``value`` is a number in range, or a schedule whose values are in range.
-
-    A schedule is checked at its first and last step and at its milestones, which are the extremes of ours.
-
-    ``bounds`` are the bounds of :func:`~cadam3d.core.checks.require_range`: ``low``, ``high``, ``below`` and
-    ``above``.
-    """
-    is_scheduled = isinstance(value, int | float | Schedule)
-    require(is_scheduled, key, expected="a number or a schedule", got=value)
-    for step in (0, *getattr(value, "milestones", ()), FAR_STEP):
-        number = value(step) if isinstance(value, Schedule) else value
-        require_range(key, number, **bounds)

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import unless_none
+from cadam3d.core.checks import Positive
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+from cadam3d.core.schedule import Schedule, as_schedule
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.baseline import Baseline, BaselineState
 from cadam3d.densifier.refine import Refine, RefinePlan
@@ -34,11 +34,7 @@ class AbsGrad(Baseline):
     about those that are cloned, as in the code of AbsGS. Without it they decide about both, as in gsplat.
     """
 
-    tau_clone: float | Schedule | None  # > 0, loss per NDC unit
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        unless_none(require_scheduled, "densifier.tau_clone", self.tau_clone, above=0)
+    tau_clone: Positive | Schedule | None  # loss per NDC unit
 
     @property
     def needs_absgrad(self) -> bool:

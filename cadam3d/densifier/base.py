@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cadam3d.core.chart import Chart
+from cadam3d.core.checks import Declared
 from cadam3d.core.edit import RowState
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderOutput
@@ -57,7 +58,7 @@ class RowCount(RowState):
     no_rows: Bool[Tensor, "n"]  # all False: the mask that marks no Gaussian
 
 
-class Densifier(ABC, Generic[State]):
+class Densifier(Declared, ABC, Generic[State]):
     """Frozen hyper-parameters; the per-Gaussian tensors are in a state that the trainer holds.
 
     Every method is pure: it returns a new state and leaves its arguments alone. So a step that fails half way

@@ -1,16 +1,16 @@
 """3DGS adaptive density control: grow where the view-space gradient is large on average (paper eq. 1)."""
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cadam3d.core.chart import Chart, Curve
-from cadam3d.core.checks import require_choice, require_range, unless_none
+from cadam3d.core.checks import Positive, one_of
 from cadam3d.core.edit import RowEdit, RowState
-from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+from cadam3d.core.schedule import Schedule, as_schedule
 from cadam3d.densifier.base import Densifier, GradientSignal
 
 VIEWS = ("sum_norm", "sum_vector", "last")
@@ -41,16 +41,10 @@ class Baseline(Densifier[BaselineState]):
     does. It always depends on the scale of the loss and of its noise (paper sec. 4.1: the dilemma).
     """
 
-    tau_pos: float | Schedule  # > 0, loss per NDC unit
-    views: str  # one of VIEWS, see `_norms`
-    grad_multiplier: float  # > 0
-    screen_px: float | None  # > 0, pixels
-
-    def __post_init__(self) -> None:
-        require_scheduled("densifier.tau_pos", self.tau_pos, above=0)
-        require_choice("densifier.views", self.views, VIEWS)
-        require_range("densifier.grad_multiplier", self.grad_multiplier, above=0)
-        unless_none(require_range, "densifier.screen_px", self.screen_px, above=0)
+    tau_pos: Positive | Schedule  # loss per NDC unit
+    views: Annotated[str, one_of(VIEWS)]  # see `_norms`
+    grad_multiplier: Positive
+    screen_px: Positive | None  # pixels
 
     def init_state(self, n: int, device: torch.device) -> BaselineState:
         """Return sums and sizes of zero."""

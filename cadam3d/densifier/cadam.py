@@ -7,15 +7,16 @@ draws, and ``cadam_open.py`` has the choices that the paper leaves open.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cadam3d.core.checks import require_choice, require_range, require_whole, unless_none
+from cadam3d.core.checks import AtLeastZero, BelowOne, Positive, Whole, one_of, require_choice
 from cadam3d.core.edit import RowState
 from cadam3d.core.reductions import all_finite, quantile
-from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+from cadam3d.core.schedule import Schedule, as_schedule
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.cadam_charts import CAdamCharts
 
@@ -43,24 +44,19 @@ class CAdamState(RowState):
 class CAdam(CAdamCharts[CAdamState]):
     """Select Gaussians whose drift is in the top quantile and large compared with its own noise."""
 
-    tau_Q: float | Schedule | None  # in [0, 1), eq. 9
-    tau_SNR: float | None  # >= 0, eq. 11 and 13
-    beta1: float  # in [0, 1), decay of m
-    beta2: float  # in [0, 1), decay of v
-    eps: float  # > 0, loss per world unit
-    min_age: int  # updates
-    reset: str  # one of RESET
-    reset_min_age: int  # updates
+    tau_Q: BelowOne | Schedule | None  # eq. 9
+    tau_SNR: AtLeastZero | None  # eq. 11 and 13
+    beta1: BelowOne  # decay of m
+    beta2: BelowOne  # decay of v
+    eps: Positive  # loss per world unit
+    min_age: Whole  # updates
+    reset: Annotated[str, one_of(RESET)]
+    reset_min_age: Whole  # updates
 
     def __post_init__(self) -> None:
-        unless_none(require_scheduled, "densifier.tau_Q", self.tau_Q, low=0, below=1)
-        unless_none(require_range, "densifier.tau_SNR", self.tau_SNR, low=0)
-        require_range("densifier.beta1", self.beta1, low=0, below=1)
-        require_range("densifier.beta2", self.beta2, low=0, below=1)
-        require_range("densifier.eps", self.eps, above=0)
-        require_whole("densifier.min_age", self.min_age, low=0)
-        require_whole("densifier.reset_min_age", self.reset_min_age, low=0)
-        require_choice("densifier.reset", self.reset, RESET if self.least_reliable is not None else RESET[:2])
+        super().__post_init__()
+        if self.least_reliable is None:
+            require_choice("densifier.reset", self.reset, RESET[:2])
 
     def init_state(self, n: int, device: torch.device) -> CAdamState:
         """Return zero moments and age 0."""

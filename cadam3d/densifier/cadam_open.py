@@ -5,12 +5,13 @@ gives the reason for each value.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_choice, require_range, unless_none
+from cadam3d.core.checks import AtLeastZero, one_of, require, within
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.cadam import CAdam, CAdamState
 from cadam3d.densifier.noise_floor import snr_threshold
@@ -24,19 +25,16 @@ class CAdamOpen(CAdam):
     """CAdam with other evidence, other gates or another reset."""
 
     # Evidence: which gradients the moments average.
-    grad_norm: str  # one of GRAD_NORM
-    invisible: str  # one of INVISIBLE
+    grad_norm: Annotated[str, one_of(GRAD_NORM)]
+    invisible: Annotated[str, one_of(INVISIBLE)]
     # Gates: which Gaussians are candidates.
-    tau_m: float | None  # >= 0, loss per world unit
-    alpha: float | None  # in (0, 1), replaces tau_SNR
+    tau_m: AtLeastZero | None  # loss per world unit
+    alpha: Annotated[float, within(above=0, below=1)] | None  # replaces tau_SNR
     # Resets.
-    tau_reset: float | None  # >= 0, null = tau_SNR
+    tau_reset: AtLeastZero | None  # null = tau_SNR
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_choice("densifier.grad_norm", self.grad_norm, GRAD_NORM)
-        require_choice("densifier.invisible", self.invisible, INVISIBLE)
-        unless_none(require_range, "densifier.tau_m", self.tau_m, low=0)
         require(
             any(gate is not None for gate in (self.tau_Q, self.tau_SNR, self.tau_m, self.alpha)),
             "densifier.tau_m",
@@ -44,7 +42,6 @@ class CAdamOpen(CAdam):
             got=self.tau_m,
             example="densifier.tau_m=0.001",
         )
-        unless_none(require_range, "densifier.tau_reset", self.tau_reset, low=0)
         require(
             self.tau_reset is None or self.reset == "unreliable",
             "densifier.tau_reset",
@@ -56,7 +53,6 @@ class CAdamOpen(CAdam):
             self._check_alpha(self.alpha)
 
     def _check_alpha(self, alpha: float) -> None:
-        require_range("densifier.alpha", alpha, above=0, below=1)
         require(
             self.tau_SNR is None,
             "densifier.tau_SNR",

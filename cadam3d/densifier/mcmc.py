@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from cadam3d.core.checks import require_range, require_whole
+from cadam3d.core.checks import AtLeastZero, Count, Share
 from cadam3d.core.device import upload
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import Gaussians
@@ -36,14 +36,9 @@ class MCMC(GradientFree):
     ``regularizer=[mean_opacity,mean_scale]``. Unlike ``refine.max_gaussians``, the cap does not end the run.
     """
 
-    cap: int  # Gaussians
-    growth: float  # in [0, 1], share per refinement
-    noise_lr: float  # >= 0, 1 / world units
-
-    def __post_init__(self) -> None:
-        require_whole("densifier.cap", self.cap, low=1)
-        require_range("densifier.growth", self.growth, low=0, high=1)
-        require_range("densifier.noise_lr", self.noise_lr, low=0)
+    cap: Count  # Gaussians
+    growth: Share  # per refinement
+    noise_lr: AtLeastZero  # 1 / world units
 
     def select(self, state: RowCount, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
         """Return the empty mask: :meth:`plan` grows in its own way, without clones and splits."""

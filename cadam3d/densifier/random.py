@@ -8,7 +8,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from cadam3d.core.chart import Chart, Curve
-from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+from cadam3d.core.checks import BelowOne
+from cadam3d.core.schedule import Schedule, as_schedule
 from cadam3d.densifier.base import GradientFree, RowCount
 
 
@@ -19,10 +20,7 @@ class RandomGrowth(GradientFree):
     If another densifier does no better at the same share, its evidence is worth nothing.
     """
 
-    share: float | Schedule  # in [0, 1), tau_Q = 1 - share
-
-    def __post_init__(self) -> None:
-        require_scheduled("densifier.share", self.share, low=0, below=1)
+    share: BelowOne | Schedule  # tau_Q = 1 - share
 
     def select(self, state: RowCount, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
         """Return a random mask of as many Gaussians as exceed the quantile ``1 - share`` (paper eq. 9)."""

@@ -1,12 +1,13 @@
 """HOW Gaussians are added and removed, and when; shared by all densifiers (paper sec. 3.1 and 4.4)."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_range, require_whole, unless_none
+from cadam3d.core.checks import BelowOne, Count, Declared, Positive, Share, Whole, require, whole, within
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import Gaussians, concatenate
 from cadam3d.core.schedule import FAR_STEP
@@ -34,57 +35,36 @@ class RefinePlan:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Refine:
+class Refine(Declared):
     """When and how Gaussians are cloned, split, pruned and reset.
 
     Steps count from 1, and lengths are in world units.
     """
 
-    steps: int  # of the run
-    start: int  # step
-    end: int  # step
-    interval: int  # steps, the paper's K
-    tau_scale: float  # > 0
-    split_children: int  # 2 to 16
-    split_shrink: float  # >= 1
-    min_opacity: float  # in [0, 1)
-    max_scale: float | None  # > 0
-    last_max_scale: float | None  # > 0
-    last_min_alpha: float | None  # in [0, 1]
-    prune_from: int  # step
-    reset_interval: int | None  # steps
-    reset_from: int  # step
-    reset_until: int  # step
-    reset_value: float  # in (0, 1), opacity
-    recovery: int  # steps
-    prune_grace: int  # steps
-    max_gaussians: int | None
+    steps: Annotated[int, whole(low=1, high=FAR_STEP)]  # of the run
+    start: Whole  # step
+    end: Whole  # step
+    interval: Count  # steps, the paper's K
+    tau_scale: Positive
+    split_children: Annotated[int, whole(low=2, high=16)]
+    split_shrink: Annotated[float, within(low=1)]
+    min_opacity: BelowOne
+    max_scale: Positive | None
+    last_max_scale: Positive | None
+    last_min_alpha: Share | None
+    prune_from: Whole  # step
+    reset_interval: Count | None  # steps
+    reset_from: Whole  # step
+    reset_until: Whole  # step
+    reset_value: Annotated[float, within(above=0, below=1)]  # opacity
+    recovery: Count  # steps
+    prune_grace: Whole  # steps
+    max_gaussians: Count | None
 
     def __post_init__(self) -> None:
-        require_whole("refine.steps", self.steps, low=1, high=FAR_STEP)
-        require_whole("refine.start", self.start, low=0)
-        require_whole("refine.end", self.end, low=0)
-        require_whole("refine.interval", self.interval, low=1)
-        require_range("refine.tau_scale", self.tau_scale, above=0)
-        require_whole("refine.split_children", self.split_children, low=2, high=16)
-        require_range("refine.split_shrink", self.split_shrink, low=1)
-        require_range("refine.min_opacity", self.min_opacity, low=0, below=1)
-        unless_none(require_range, "refine.max_scale", self.max_scale, above=0)
-        unless_none(require_range, "refine.last_max_scale", self.last_max_scale, above=0)
-        unless_none(require_range, "refine.last_min_alpha", self.last_min_alpha, low=0, high=1)
-        require_whole("refine.prune_from", self.prune_from, low=0)
-        unless_none(require_whole, "refine.max_gaussians", self.max_gaussians, low=1)
-        self._check_reset()
-
-    def _check_reset(self) -> None:
-        require_whole("refine.reset_from", self.reset_from, low=0)
-        require_whole("refine.reset_until", self.reset_until, low=0)
-        require_range("refine.reset_value", self.reset_value, above=0, below=1)
-        require_whole("refine.recovery", self.recovery, low=1)
-        require_whole("refine.prune_grace", self.prune_grace, low=0)
+        super().__post_init__()
         if self.reset_interval is None:
             return
-        require_whole("refine.reset_interval", self.reset_interval, low=1)
         require(
             self.min_opacity < self.reset_value or self.prune_grace > 0,
             "refine.min_opacity",

@@ -9,6 +9,7 @@ from jaxtyping import Float, Real
 from torch import Tensor
 
 from cadam3d.core.chart import Chart
+from cadam3d.core.checks import Declared
 from cadam3d.prior.base import Condition, DiffusionPrior
 
 
@@ -22,7 +23,7 @@ class GuidanceOutput:
     log: Mapping[str, Real[Tensor, ""] | float]
 
 
-class Guidance(ABC):
+class Guidance(Declared, ABC):
     """A distillation objective (paper eq. 4). Holds frozen hyper-parameters and no state."""
 
     @abstractmethod

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+from cadam3d.core.checks import Share
+from cadam3d.core.schedule import Schedule, as_schedule
 from cadam3d.guidance.distill import Case, Comparison, Distillation
 from cadam3d.guidance.trajectory import UNGUIDED
 
@@ -28,11 +29,7 @@ class CSD(Distillation):
     Each step makes two predictions of a single branch, and a third if 0 < r < 1.
     """
 
-    empty_share: float | Schedule  # in [0, 1]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_scheduled("guidance.empty_share", self.empty_share, low=0, high=1)
+    empty_share: Share | Schedule
 
     def compare(self, case: Case) -> Comparison:
         """Subtract the noise of the reference prediction from the noise predicted under the prompt."""

@@ -3,15 +3,16 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from cadam3d.core.chart import Chart, Curve
-from cadam3d.core.checks import require_choice, require_range
+from cadam3d.core.checks import AtLeastZero, Positive, one_of
 from cadam3d.core.device import upload, upload_together
-from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+from cadam3d.core.schedule import Schedule, as_schedule
 from cadam3d.guidance.base import GuidanceOutput
 from cadam3d.guidance.window import WindowedGuidance
 from cadam3d.prior.base import Condition, DiffusionPrior
@@ -110,18 +111,10 @@ class Distillation(WindowedGuidance):
     minus the predicted clean image) and ``guidance_nonfinite`` (elements replaced by 0).
     """
 
-    weight: float  # > 0
-    weighting: str  # w(t), one of WEIGHTINGS
-    reduction: str  # one of DIVISORS
-    clip: float | Schedule | None  # > 0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_range("guidance.weight", self.weight, above=0)
-        require_choice("guidance.weighting", self.weighting, list(WEIGHTINGS))
-        require_choice("guidance.reduction", self.reduction, list(DIVISORS))
-        if self.clip is not None:
-            require_scheduled("guidance.clip", self.clip, above=0)
+    weight: Positive
+    weighting: Annotated[str, one_of(WEIGHTINGS)]  # w(t)
+    reduction: Annotated[str, one_of(DIVISORS)]
+    clip: Positive | Schedule | None
 
     @abstractmethod
     def compare(self, case: Case) -> Comparison:
@@ -172,11 +165,7 @@ class GuidedDistillation(Distillation):
     Guidance has the conventional form, negative + scale * (positive - negative).
     """
 
-    scale: float  # >= 0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_range("guidance.scale", self.scale, low=0)
+    scale: AtLeastZero
 
 
 def surrogate(

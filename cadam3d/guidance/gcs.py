@@ -1,15 +1,16 @@
 """GCS: compares the prior's trajectory through the render with the trajectory that the prompt would take."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.chart import Chart, Curve
-from cadam3d.core.checks import require, require_choice, require_range
+from cadam3d.core.checks import AtLeastZero, Positive, one_of, require, within
 from cadam3d.core.device import upload_together
-from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+from cadam3d.core.schedule import Schedule, as_schedule
 from cadam3d.guidance.base import GuidanceOutput
 from cadam3d.guidance.distill import DIVISORS, RESIDUAL, Case, finite, offset_normal, rms, surrogate
 from cadam3d.guidance.trajectory import ROW, UNGUIDED
@@ -90,29 +91,22 @@ class GCS(WindowedGuidance):
     predicted clean image) and ``guidance_nonfinite`` (elements replaced by 0).
     """
 
-    scale: float  # >= 0
-    weight: float  # > 0
-    w_cc: float  # >= 0
-    w_gc: float  # >= 0
-    w_cp: float  # >= 0
-    delta: float | Schedule  # in t; in (0.01, 0.5]
+    scale: AtLeastZero
+    weight: Positive
+    w_cc: AtLeastZero
+    w_gc: AtLeastZero
+    w_cp: AtLeastZero
+    delta: Annotated[float | Schedule, within(above=GAP, high=0.5)]  # in t
     fixed_noise: bool
-    noise_offset: float  # >= 0
-    reduction: str  # one of DIVISORS
+    noise_offset: AtLeastZero
+    reduction: Annotated[str, one_of(DIVISORS)]
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range("guidance.scale", self.scale, low=0)
-        require_range("guidance.weight", self.weight, above=0)
-        for key, value in (("w_cc", self.w_cc), ("w_gc", self.w_gc), ("w_cp", self.w_cp)):
-            require_range(f"guidance.{key}", value, low=0)
         is_any = max(self.w_cc, self.w_gc, self.w_cp) > 0
         require(
             is_any, "guidance.w_gc", expected="a number > 0, since w_cc and w_cp are 0 as well", got=self.w_gc
         )
-        require_scheduled("guidance.delta", self.delta, above=GAP, high=0.5)
-        require_range("guidance.noise_offset", self.noise_offset, low=0)
-        require_choice("guidance.reduction", self.reduction, list(DIVISORS))
 
     def __call__(
         self,

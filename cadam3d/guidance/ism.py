@@ -1,11 +1,12 @@
 """ISM: adds noise along the prior's own trajectory instead of at random, and compares two points of it."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 
-from cadam3d.core.checks import require_range
-from cadam3d.core.schedule import Schedule, as_schedule, require_scheduled
+from cadam3d.core.checks import AtLeastZero, BelowOne, within
+from cadam3d.core.schedule import Schedule, as_schedule
 from cadam3d.guidance.distill import Case, Comparison, GuidedDistillation, offset_normal
 from cadam3d.guidance.trajectory import UNGUIDED, ddim, strides
 
@@ -30,17 +31,10 @@ class ISM(GuidedDistillation):
     ``shared_t`` the longest inversion of the batch sets the number.
     """
 
-    delta: float | Schedule  # in t; in (0, 1]
-    inversion_stride: float  # in t; in (0, 1]
-    initial_noise: float  # in t; in [0, 1)
-    noise_offset: float  # >= 0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_range("guidance.inversion_stride", self.inversion_stride, above=0, high=1)
-        require_range("guidance.initial_noise", self.initial_noise, low=0, below=1)
-        require_range("guidance.noise_offset", self.noise_offset, low=0)
-        require_scheduled("guidance.delta", self.delta, above=0, high=1)
+    delta: Annotated[float | Schedule, within(above=0, high=1)]  # in t
+    inversion_stride: Annotated[float, within(above=0, high=1)]  # in t
+    initial_noise: BelowOne  # in t
+    noise_offset: AtLeastZero
 
     def compare(self, case: Case) -> Comparison:
         """Subtract the noise at s without a prompt from the guided noise at t, on one trajectory."""

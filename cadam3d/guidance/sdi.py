@@ -1,12 +1,13 @@
 """SDI: finds the noise that would have led to the render by inverting the prior under its prompt."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require_choice, require_range
+from cadam3d.core.checks import AtLeastZero, BelowOne, one_of, within
 from cadam3d.guidance.distill import Case, Comparison, GuidedDistillation
 from cadam3d.guidance.trajectory import ROW, ddim, strides
 from cadam3d.prior.path import per_view
@@ -50,19 +51,11 @@ class SDI(GuidedDistillation):
     - It divides the mean over all elements by the number of views once more.
     """
 
-    inversion_scale: float
-    inversion_grid: str  # one of GRIDS
-    inversion_stride: float  # in t; in (0, 1]
-    overshoot: float  # in t; in [0, 1)
-    eta: float  # >= 0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_range("guidance.inversion_scale", self.inversion_scale)
-        require_choice("guidance.inversion_grid", self.inversion_grid, GRIDS)
-        require_range("guidance.inversion_stride", self.inversion_stride, above=0, high=1)
-        require_range("guidance.overshoot", self.overshoot, low=0, below=1)
-        require_range("guidance.eta", self.eta, low=0)
+    inversion_scale: Annotated[float, within()]
+    inversion_grid: Annotated[str, one_of(GRIDS)]
+    inversion_stride: Annotated[float, within(above=0, high=1)]  # in t
+    overshoot: BelowOne  # in t
+    eta: AtLeastZero
 
     def compare(self, case: Case) -> Comparison:
         """Subtract the noise that the inversion found from the guided noise."""

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require_choice, require_range, require_whole
+from cadam3d.core.checks import Share, one_of, whole
 from cadam3d.guidance.distill import Case, Comparison, GuidedDistillation
 from cadam3d.guidance.trajectory import ROW, ddim
 from cadam3d.prior.path import NoisePath, per_view
@@ -50,15 +51,9 @@ class UCM(GuidedDistillation):
     A step makes ``inversion_steps`` predictions without guidance, the first at t = 0, and one with guidance.
     """
 
-    inversion_steps: int  # >= 1
-    inversion_grid: str  # one of GRIDS
-    fresh_noise: float  # in [0, 1]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_whole("guidance.inversion_steps", self.inversion_steps, low=1, high=1000)
-        require_choice("guidance.inversion_grid", self.inversion_grid, list(GRIDS))
-        require_range("guidance.fresh_noise", self.fresh_noise, low=0, high=1)
+    inversion_steps: Annotated[int, whole(low=1, high=1000)]
+    inversion_grid: Annotated[str, one_of(GRIDS)]
+    fresh_noise: Share
 
     def compare(self, case: Case) -> Comparison:
         """Subtract the velocity of the coupled pair from the guided velocity."""

@@ -1,13 +1,14 @@
 """The window of noise levels that an objective draws from; schedules may move it during training."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require
-from cadam3d.core.schedule import FAR_STEP, Schedule, as_schedule, require_scheduled
+from cadam3d.core.checks import require, within
+from cadam3d.core.schedule import FAR_STEP, Schedule, as_schedule
 from cadam3d.guidance.base import Guidance
 
 
@@ -18,13 +19,12 @@ class WindowedGuidance(Guidance):
     With t_min = t_max the level is not random: the same schedule for both is DreamGaussian's annealing of t.
     """
 
-    t_min: float | Schedule  # in [0, t_max]
-    t_max: float | Schedule  # in [t_min, 1]
+    t_min: Annotated[float | Schedule, within()]  # in [0, t_max]
+    t_max: Annotated[float | Schedule, within()]  # in [t_min, 1]
     shared_t: bool
 
     def __post_init__(self) -> None:
-        require_scheduled("guidance.t_min", self.t_min)
-        require_scheduled("guidance.t_max", self.t_max)
+        super().__post_init__()
         # At the steps in between, the two may cross. These are checked when training reaches them.
         for step in (0, FAR_STEP):
             self.window(step)
