@@ -5,7 +5,6 @@ import torch
 from splats import make_gaussians
 
 from cadam3d.augmentation import LucidAugmentation
-from cadam3d.core.errors import UserError
 from cadam3d.core.rendering import RenderOutput
 
 
@@ -94,10 +93,3 @@ def test_later_draws_do_not_depend_on_the_number_of_gaussians_or_on_earlier_outc
         states.append(generator.get_state())
     assert torch.equal(states[0], states[1])
     assert torch.equal(states[0], states[2])
-
-
-@pytest.mark.parametrize("key", ["scale_noise", "disparity", "flip"])
-@pytest.mark.parametrize("value", [-0.1, 1.1, float("nan")])
-def test_an_impossible_value_is_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"augmentation\.{key}: expected "):
-        LucidAugmentation(**{"scale_noise": 0.1, "disparity": 0.2, "flip": 0.5, key: value})

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from cadam3d.background import BlackOrWhite, ConstantBackground, LucidBackground, RandomBackground
-from cadam3d.core.errors import UserError
+from cadam3d.background import BlackOrWhite, LucidBackground, RandomBackground
 
 
 def draw(seed: int = 0) -> torch.Generator:
@@ -68,28 +67,6 @@ def test_later_draws_do_not_depend_on_the_probabilities():
     ):
         first, *others = [after(background) for background in family]
         assert all(torch.equal(first, other) for other in others)
-
-
-@pytest.mark.parametrize("color", [[0.0, 0.0], [0.0, 0.0, 1.5], [-0.1, 0.0, 0.0], [float("nan"), 0.0, 0.0]])
-def test_invalid_colors_are_refused(color):
-    with pytest.raises(UserError, match=r"background\.color: expected three numbers"):
-        ConstantBackground(color=color)
-    with pytest.raises(UserError, match=r"background\.color: expected three numbers"):
-        RandomBackground(probability=0.5, color=color, shared=False)
-    with pytest.raises(UserError, match=r"background\.color: expected three numbers"):
-        LucidBackground(probability=0.5, black=0.5, color=color)
-
-
-@pytest.mark.parametrize("probability", [-0.1, 1.1])
-def test_an_impossible_probability_is_refused(probability):
-    with pytest.raises(UserError, match=r"background\.probability"):
-        RandomBackground(probability=probability, color=[0.0, 0.0, 0.0], shared=False)
-    with pytest.raises(UserError, match=r"background\.probability"):
-        LucidBackground(probability=probability, black=0.5, color=[0.0, 0.0, 0.0])
-    with pytest.raises(UserError, match=r"background\.black"):
-        LucidBackground(probability=0.5, black=probability, color=[0.0, 0.0, 0.0])
-    with pytest.raises(UserError, match=r"background\.white"):
-        BlackOrWhite(white=probability)
 
 
 def test_a_shared_background_has_one_colour_per_step():

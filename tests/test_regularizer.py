@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderOutput
 from cadam3d.core.schedule import Linear
@@ -133,12 +132,3 @@ def test_disparity_variation_is_the_squared_variation_of_the_disparity_alone():
     assert variation == pytest.approx(at(SquaredVariation(weight=1.0), rgb=grey))
     assert variation > 0
     assert at(DisparityVariation(weight=1.0), rgb=0 * rgb, alpha=alpha) == variation
-
-
-def test_a_negative_weight_or_radius_is_refused():
-    with pytest.raises(UserError, match="weight"):
-        MeanScale(weight=-1.0)
-    with pytest.raises(UserError, match="weight"):
-        MeanScale(weight=Linear(start=1.0, end=-1.0, steps=10))
-    with pytest.raises(UserError, match="radius"):
-        OutsideBall(weight=1.0, radius=0.0)

@@ -2,9 +2,10 @@
 
 import math
 import sys
-from collections.abc import Iterator
-from functools import cache
-from typing import Any, get_type_hints
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, replace
+from functools import cache, partial
+from typing import Any, get_args, get_type_hints
 
 import jaxtyping
 import pytest
@@ -15,9 +16,21 @@ from omegaconf import DictConfig, OmegaConf
 
 from cadam3d import cli
 from cadam3d.build import build_trainer, component, components, require_unused
+from cadam3d.camera.progressive import require_widening
+from cadam3d.camera.ranges import require_interval
 from cadam3d.commands.messages import keeping_others
+from cadam3d.core.checks import (
+    declared,
+    require_choice,
+    require_color,
+    require_each,
+    require_range,
+    require_whole,
+)
 from cadam3d.core.errors import UserError
 from cadam3d.core.memory import is_out_of_memory
+from cadam3d.core.pictures import require_angles
+from cadam3d.core.schedule import Schedule, Steps
 from cadam3d.settings.check import require_settings
 from cadam3d.settings.compose import compose
 from cadam3d.settings.options import config_dir
@@ -102,6 +115,8 @@ def refusal(node: str, file: str, key: str, value: Any) -> str | None:
     parent, _, name = key.rpartition(".")
     holder = OmegaConf.select(cfg, parent)
     before = holder._get_node(name)
+    if before is not None:
+        del holder[name]
     OmegaConf.update(cfg, key, value, merge=False, force_add=True)
     try:
         component(OmegaConf.select(cfg, node), object, node)
@@ -141,6 +156,55 @@ def test_every_setting_of_every_component_refuses_what_it_cannot_use(node, file)
                 assert message.startswith(f"{key.partition('.')[0]}."), message
                 assert "Try: " in message, message
                 assert "\n" not in message, message
+
+
+# Numbers whose bounds depend on other settings, or that the class checks itself.
+BY_HAND = {
+    *("exporter.turntable.fps", "exporter.progress.fps", "prior.size"),
+    *("prior.spread", "prior.edge_spread", "prior.model_error", "prior.samples_per_pixel"),
+    *("prior.census_size", "prior.seed", "truth.samples_per_pixel", "truth.turns"),
+}
+
+
+def beyond(check: partial[None]) -> list[Any]:
+    """Return values that a declared check must refuse."""
+    bounds = check.keywords
+    if check.func is require_whole:
+        return [bounds[side] + step for side, step in (("low", -1), ("high", 1)) if side in bounds]
+    if check.func is require_range:
+        just = {"low": -math.inf, "high": math.inf}
+        outside = [math.nextafter(bounds[side], just[side]) for side in just if side in bounds]
+        return [*outside, *(bounds[side] for side in ("above", "below") if side in bounds)]
+    if check.func is require_each:
+        return [[value] for value in beyond(bounds["check"])]
+    low, high, limit = (bounds.get(name, 0) for name in ("low", "high", "limit"))
+    return {
+        require_choice: [-1 if isinstance(next(iter(bounds.get("choices", "a"))), int) else "none of these"],
+        require_interval: [[high, low], [low - 1, high], [low, high + 1], [low]],
+        require_angles: [[], [limit + 1], [-limit - 1]],
+        require_color: [[0, 0], [0, 0, 1.5], [-0.1, 0, 0]],
+        require_widening: [],
+    }[check.func]
+
+
+@pytest.mark.parametrize(("node", "file"), options())
+def test_every_number_declares_its_bounds_and_is_refused_beyond_them(node, file):
+    built = component(OmegaConf.select(with_option(node, file), node), object, node)
+    for name, hint in get_type_hints(type(built)).items():
+        is_number = {int, float, Sequence[float]} & {hint, *get_args(hint)}
+        is_setting = name in [each.name for each in fields(built) if each.init]
+        checks = declared(type(built)).get(name, ((), False))[0]
+        assert checks or not (is_number and is_setting) or f"{node}.{name}" in BY_HAND, name
+        wrong = [value for check in checks for value in beyond(check)]
+        if wrong:
+            assert f"{node}.{name}: expected " in (refusal(node, file, f"{node}.{name}", wrong[0]) or ""), (
+                name
+            )
+        if Schedule in get_args(hint):
+            wrong += [Steps(values=[0.5, value], milestones=[7]) for value in wrong]
+        for value in wrong:
+            with pytest.raises(UserError, match=rf"^{type(built).__name__}\.{name}: expected "):
+                replace(built, **{name: value})
 
 
 @pytest.mark.parametrize(("node", "file"), options())
@@ -212,7 +276,7 @@ WRONG_LINES = {
     "+camera.foo.bar=1": "camera.foo: no such setting. Try: cadam3d train --cfg job",
     "+callback.foo.bar=1": "callback.foo: is not chosen",
     "callback.progress.refresh_seconds=abc": "callback.progress.refresh_seconds: expected a finite number",
-    "camera.size=10000000": "camera.size: expected a whole number",
+    "camera.size=10000000": "camera.size: expected a number >= 1 and <= 16384",
     "views=100000000000": "views: expected a number",
     "initializer.count=1000000000000": "initializer.count: expected a whole number",
     "exporter.turntable.size=10000000": "exporter.turntable.size: expected a whole number",

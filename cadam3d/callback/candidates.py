@@ -2,16 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from functools import partial
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cadam3d.callback.base import Callback
-from cadam3d.core.checks import require_range, require_whole
+from cadam3d.core.checks import Count, Elevation, whole
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.pictures import PictureSettings
+from cadam3d.core.pictures import PictureSettings, require_angles
 from cadam3d.core.sh import rgb_to_sh0
 from cadam3d.io.image import drop_step_pictures, step_picture, write_png
 from cadam3d.io.jsonl import append_jsonl, truncate_after
@@ -34,19 +35,10 @@ class Candidates(PictureSettings, Callback):
     does not change the run.
     """
 
-    node: ClassVar[str] = "callback.candidates"
-
-    every: int  # steps
-    azimuths_deg: Sequence[float]  # in [-360, 360]
-    elevation_deg: float  # in [-90, 90]
-    bins_per_decade: int  # >= 1
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_whole("callback.candidates.every", self.every, low=1)
-        self.require_angles("azimuths_deg", self.azimuths_deg, limit=360)
-        require_range("callback.candidates.elevation_deg", self.elevation_deg, low=-90, high=90)
-        require_whole("callback.candidates.bins_per_decade", self.bins_per_decade, low=1, high=1000)
+    every: Count  # steps
+    azimuths_deg: Annotated[Sequence[float], partial(require_angles, limit=360)]
+    elevation_deg: Elevation
+    bins_per_decade: Annotated[int, whole(low=1, high=1000)]
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Delete lines and pictures that a killed run wrote after its last checkpoint."""

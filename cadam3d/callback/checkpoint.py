@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from cadam3d.callback.base import Callback
-from cadam3d.core.checks import require_whole
+from cadam3d.core.checks import Count
 from cadam3d.io.checkpoint import drop_after, prune_checkpoints, save_checkpoint
 from cadam3d.io.run_folder import CHECKPOINTS, checkpoint_name
 from cadam3d.state import Outcome, RunContext, StepReport, TrainState
@@ -13,12 +13,8 @@ from cadam3d.state import Outcome, RunContext, StepReport, TrainState
 class Checkpoint(Callback):
     """Save the whole :class:`TrainState`, atomically, into ``checkpoints/`` of the run folder."""
 
-    every: int  # steps
-    keep: int  # files
-
-    def __post_init__(self) -> None:
-        require_whole("callback.checkpoint.every", self.every, low=1)
-        require_whole("callback.checkpoint.keep", self.keep, low=1)
+    every: Count  # steps
+    keep: Count  # files
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Delete checkpoints of later steps, because this run will write its own."""

@@ -11,11 +11,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from cadam3d.callback.base import Callback
 from cadam3d.callback.row_history import RowHistory
-from cadam3d.core.checks import require_range
+from cadam3d.core.checks import within
 from cadam3d.io.live import Watch, begin, publish, publish_state
 from cadam3d.io.run_folder import LIVE_SNAPSHOT
 from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainState
@@ -31,8 +31,8 @@ class Live(Callback):
     a full disk ends the live view but not the run.
     """
 
-    seconds: float  # >= 0.1, between two snapshots
-    share: float  # in (0, 1], of the time of training
+    seconds: Annotated[float, within(low=0.1)]  # between two snapshots
+    share: Annotated[float, within(above=0, high=1)]  # of the time of training
     # Whether files can be written. Becomes False after the first failure.
     _works: bool = field(default=False, init=False, repr=False)
     _watch: Watch = field(default_factory=lambda: Watch(Path()), init=False, repr=False)
@@ -42,10 +42,6 @@ class Live(Callback):
     _shown: tuple[int, bool] = field(default=(-1, False), init=False, repr=False)
     _loss: float | None = field(default=None, init=False, repr=False)
     _history: RowHistory = field(default_factory=RowHistory, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        require_range("callback.live.seconds", self.seconds, low=0.1)
-        require_range("callback.live.share", self.share, above=0, high=1)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Create ``live/`` and write the first numbers, so that a page finds them."""

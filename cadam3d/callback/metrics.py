@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from cadam3d.callback.base import Callback
-from cadam3d.core.checks import require_whole
+from cadam3d.core.checks import Count
 from cadam3d.io.jsonl import append_jsonl, truncate_after
 from cadam3d.io.run_folder import METRICS
 from cadam3d.state import RefineReport, RunContext, StepReport, TrainState
@@ -13,10 +13,7 @@ from cadam3d.state import RefineReport, RunContext, StepReport, TrainState
 class Metrics(Callback):
     """Append to ``metrics.jsonl`` in the run folder; a resumed run first deletes what it will repeat."""
 
-    every: int  # steps
-
-    def __post_init__(self) -> None:
-        require_whole("callback.metrics.every", self.every, low=1)
+    every: Count  # steps
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Delete lines of steps that a killed run did after its last checkpoint."""

@@ -1,11 +1,10 @@
 """Previews: writes a contact sheet every so many steps, so that a failing run is noticed early."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from cadam3d.callback.base import Callback
-from cadam3d.core.checks import require_range, require_whole
-from cadam3d.core.pictures import PictureSettings
+from cadam3d.core.checks import Count, Elevation
+from cadam3d.core.pictures import PictureSettings, Views
 from cadam3d.io.image import contact_sheet, drop_step_pictures, step_picture, write_png
 from cadam3d.io.run_folder import PREVIEWS
 from cadam3d.state import RunContext, StepReport, TrainState
@@ -18,18 +17,9 @@ class Previews(PictureSettings, Callback):
     Several faces, or an object that is empty, flat or off centre, are visible here long before the end.
     """
 
-    node: ClassVar[str] = "callback.previews"
-
-    every: int | None  # steps
-    views: int  # >= 1
-    elevation_deg: float  # in [-90, 90]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.every is not None:
-            require_whole("callback.previews.every", self.every, low=1)
-        self.require_views(self.views)
-        require_range("callback.previews.elevation_deg", self.elevation_deg, low=-90, high=90)
+    every: Count | None  # steps
+    views: Views
+    elevation_deg: Elevation
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Delete pictures that a killed run drew after its last checkpoint."""

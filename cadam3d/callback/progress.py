@@ -13,7 +13,7 @@ import torch
 from tqdm import tqdm
 
 from cadam3d.callback.base import Callback
-from cadam3d.core.checks import require_range
+from cadam3d.core.checks import AtLeastZero
 from cadam3d.core.console import say, visible
 from cadam3d.state import Outcome, RunContext, StepReport, TrainState
 
@@ -30,8 +30,8 @@ class Progress(Callback):
     lines.
     """
 
-    refresh_seconds: float
-    line_seconds: float
+    refresh_seconds: AtLeastZero
+    line_seconds: AtLeastZero
     _bar: tqdm | None = field(default=None, init=False, repr=False)
     # The step and the seconds of training at which this process started.
     _begun: tuple[int, float] = field(default=(0, 0.0), init=False, repr=False)
@@ -39,10 +39,6 @@ class Progress(Callback):
     _due: float = field(default=0.0, init=False, repr=False)
     # The line of the last step; empty once it has been printed.
     _pending: str = field(default="", init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        require_range("callback.progress.refresh_seconds", self.refresh_seconds, low=0)
-        require_range("callback.progress.line_seconds", self.line_seconds, low=0)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Open the bar at the current step, if standard error can show one."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from cadam3d.callback.base import Callback
 from cadam3d.callback.row_history import RowHistory
-from cadam3d.core.checks import require_whole
+from cadam3d.core.checks import Count, Whole
 from cadam3d.core.errors import UserError
 from cadam3d.io.atomic import replacing
 from cadam3d.io.run_folder import SNAPSHOTS, snapshot_name, snapshots
@@ -23,13 +23,9 @@ class Snapshots(Callback):
     that cannot be written does not stop the run.
     """
 
-    every: int  # steps
-    largest: int  # Gaussians
+    every: Count  # steps
+    largest: Whole  # Gaussians
     _history: RowHistory = field(default_factory=RowHistory, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        require_whole("callback.snapshots.every", self.every, low=1)
-        require_whole("callback.snapshots.largest", self.largest, low=0)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Record the start. Delete what a killed run recorded after its last checkpoint."""

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 from cadam3d.callback.base import Callback
 from cadam3d.callback.metrics import step_numbers
-from cadam3d.core.checks import require_whole
+from cadam3d.core.checks import Count
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.image import step_picture
@@ -29,7 +29,7 @@ class Tracking(Callback):
 
     package: ClassVar[str]  # that pip installs; also the name of the callback and of the extra
 
-    every: int  # steps
+    every: Count  # steps
     _works: bool = field(default=True, init=False, repr=False)
     # The last step that was reported, if any, and its numbers. They are passed on one step later. By then the
     # preview of the step has been drawn, even if the callback that draws it comes later in the list.
@@ -42,7 +42,7 @@ class Tracking(Callback):
                 f"callback={self.package}: expected the package {self.package}, got none. "
                 f"Try: pip install '.[{self.package}]'"
             )
-        require_whole(f"callback.{self.package}.every", self.every, low=1)
+        super().__post_init__()
 
     @abstractmethod
     def open(self, context: RunContext, step: int) -> None:

@@ -13,10 +13,10 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from cadam3d.callback.tracking import Tracking
-from cadam3d.core.checks import require_choice, require_range
+from cadam3d.core.checks import one_of, within
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.jsonl import is_whole, read_json, write_json
@@ -43,17 +43,12 @@ class Wandb(Tracking):
 
     project: str
     entity: str | None  # a user or team of Weights & Biases
-    mode: str  # auto | offline
-    timeout: float  # seconds
+    mode: Annotated[str, one_of(MODES)]
+    timeout: Annotated[float, within(low=1)]  # seconds
     _run: Any = field(default=None, init=False, repr=False)
     _file: Path = field(default=Path(), init=False, repr=False)
     _id: str = field(default="", init=False, repr=False)
     _recorded: int = field(default=0, init=False, repr=False)  # the last step
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_choice("callback.wandb.mode", self.mode, MODES)
-        require_range("callback.wandb.timeout", self.timeout, low=1)
 
     def open(self, context: RunContext, step: int) -> None:
         """Start a run of wandb, or continue the folder's run: offline, unless a server accepts it."""

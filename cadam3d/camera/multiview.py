@@ -10,9 +10,9 @@ import torch
 
 from cadam3d.camera.base import CameraSampler
 from cadam3d.camera.ranges import (
-    Elevations,
+    ElevationRange,
+    FovRange,
     Law,
-    Lenses,
     Size,
     elevations,
     image_size,
@@ -37,11 +37,11 @@ class Multiview(CameraSampler):
     """
 
     size: Size  # pixels
-    elevation_deg: Elevations
+    elevation_deg: ElevationRange
     elevation_law: Law
     # World units.
     relative_distance: Annotated[Sequence[float], partial(require_interval, low=0, high=100)]
-    fov_y_deg: Lenses
+    fov_y_deg: FovRange
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -6,11 +6,11 @@ import torch
 
 from cadam3d.camera.base import CameraSampler
 from cadam3d.camera.ranges import (
-    Azimuths,
-    Distances,
-    Elevations,
+    AzimuthRange,
+    DistanceRange,
+    ElevationRange,
+    FovRange,
     Law,
-    Lenses,
     Size,
     elevations,
     image_size,
@@ -28,11 +28,11 @@ class Orbit(CameraSampler):
     """
 
     size: Size  # pixels
-    azimuth_deg: Azimuths
-    elevation_deg: Elevations
+    azimuth_deg: AzimuthRange
+    elevation_deg: ElevationRange
     elevation_law: Law
-    distance: Distances  # world units
-    fov_y_deg: Lenses
+    distance: DistanceRange  # world units
+    fov_y_deg: FovRange
 
     def sample(self, step: int, views: int, generator: torch.Generator) -> Cameras:
         """Draw one camera per stratum of azimuth, and everything else independently for each camera.

@@ -57,9 +57,9 @@ def require_interval(key: str, interval: object, *, low: float, high: float) -> 
 
 
 Size = Annotated[int | Schedule, within(low=1, high=MOST_PIXELS)]
-Azimuths = Annotated[Sequence[float], partial(require_interval, low=-360, high=360)]
-Elevations = Annotated[Sequence[float], partial(require_interval, low=-90, high=90)]
+AzimuthRange = Annotated[Sequence[float], partial(require_interval, low=-360, high=360)]
+ElevationRange = Annotated[Sequence[float], partial(require_interval, low=-90, high=90)]
 # Outside the unit ball, which the object may fill.
-Distances = Annotated[Sequence[float], partial(require_interval, low=1, high=1000)]
-Lenses = Annotated[Sequence[float], partial(require_interval, low=1, high=170)]
+DistanceRange = Annotated[Sequence[float], partial(require_interval, low=1, high=1000)]
+FovRange = Annotated[Sequence[float], partial(require_interval, low=1, high=170)]
 Law = Annotated[str, one_of(ELEVATION_LAWS)]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from cadam3d.camera.base import CameraSampler
-from cadam3d.camera.ranges import Distances, Lenses, Size, image_size, uniform
+from cadam3d.camera.ranges import DistanceRange, FovRange, Size, image_size, uniform
 from cadam3d.core.cameras import Cameras, orbit
 
 
@@ -18,8 +18,8 @@ class Sphere(CameraSampler):
     """
 
     size: Size  # pixels
-    distance: Distances  # [low, high], world units
-    fov_y_deg: Lenses  # [low, high]
+    distance: DistanceRange  # [low, high], world units
+    fov_y_deg: FovRange  # [low, high]
 
     def sample(self, step: int, views: int, generator: torch.Generator) -> Cameras:
         """Draw directions such that equal areas are equally likely.

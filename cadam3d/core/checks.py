@@ -97,9 +97,10 @@ def nearest(word: object, known: Iterable[str], *, least: float = 0.6) -> str:
 
 
 def require_color(key: str, value: object, *, otherwise: str = "") -> None:
-    """Raise unless ``value`` is an RGB colour, three numbers in [0, 1]; the message adds ``otherwise``."""
+    """Raise unless ``value`` is an RGB colour, three numbers in [0, 1], or the word ``otherwise``."""
     is_color = are_numbers(value, low=0, high=1) and len(value) == 3
-    require(is_color, key, expected=f"three numbers in [0, 1]{otherwise}", got=value)
+    expected = f"three numbers in [0, 1] or {otherwise}" if otherwise else "three numbers in [0, 1]"
+    require(is_color or (bool(otherwise) and value == otherwise), key, expected=expected, got=value)
 
 
 def are_numbers(value: object, *, low: float, high: float) -> TypeGuard[Sequence[float]]:
@@ -125,6 +126,17 @@ def whole(**bounds: float) -> Check:
 def one_of(choices: Collection[object]) -> Check:
     """Return the check that a value is one of ``choices``."""
     return partial(require_choice, choices=choices)
+
+
+def each(check: Check) -> Check:
+    """Return the check of a sequence, of which every item passes ``check``."""
+    return partial(require_each, check=check)
+
+
+def require_each(key: str, values: Iterable[object], check: Check) -> None:
+    """Raise ``UserError`` unless every value passes ``check``."""
+    for value in values:
+        check(key, value)
 
 
 Positive = Annotated[float, within(above=0)]

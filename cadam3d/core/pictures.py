@@ -5,14 +5,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import partial
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, orbit, turntable
-from cadam3d.core.checks import are_numbers, require, require_color, require_range, require_whole
+from cadam3d.core.checks import Color, Declared, Positive, are_numbers, require, require_color, whole, within
 
 # Far more than anyone looks at.
 MOST_VIEWS = 10_000  # pictures of one asset
@@ -20,22 +21,24 @@ MOST_PIXELS = 16_384  # along the edge of a picture
 TRANSPARENT = "transparent"
 
 
+def require_angles(key: str, angles_deg: object, *, limit: int) -> None:
+    """Raise ``UserError`` unless ``angles_deg`` is a list of angles in [-limit, limit] degrees."""
+    is_angles = are_numbers(angles_deg, low=-limit, high=limit) and len(angles_deg) > 0
+    require(is_angles, key, expected=f"at least one angle, each in [-{limit}, {limit}]", got=angles_deg)
+
+
+Views = Annotated[int, whole(low=1, high=MOST_VIEWS)]
+Elevations = Annotated[Sequence[float], partial(require_angles, limit=90)]
+
+
 @dataclass(frozen=True, kw_only=True)
-class ViewSettings:
+class ViewSettings(Declared):
     """Distance, field of view and size of square pictures of an asset."""
 
-    # Node of the configuration, such as "exporter.preview", with which error messages begin.
-    node: ClassVar[str]
-
-    distance: float  # > 0, world units
-    fov_y_deg: float  # in (0, 180)
-    size: int  # >= 1, pixels
+    distance: Positive  # world units
+    fov_y_deg: Annotated[float, within(above=0, below=180)]
+    size: Annotated[int, whole(low=1, high=MOST_PIXELS)]
     background: Sequence[float] | str  # RGB in [0, 1], or TRANSPARENT where that is allowed
-
-    def __post_init__(self) -> None:
-        require_range(f"{self.node}.distance", self.distance, above=0)
-        require_range(f"{self.node}.fov_y_deg", self.fov_y_deg, above=0, below=180)
-        require_whole(f"{self.node}.size", self.size, low=1, high=MOST_PIXELS)
 
     def ring(self, views: int, elevation_deg: float) -> Cameras:
         """Return ``views`` cameras evenly spaced over one full turn, starting at the front."""
@@ -59,20 +62,6 @@ class ViewSettings:
         color = (0.0, 0.0, 0.0) if isinstance(self.background, str) else self.background
         return torch.tensor([[float(channel) for channel in color]] * views)
 
-    def require_views(self, views: int) -> None:
-        """Raise ``UserError`` unless ``views`` is a reasonable number of pictures."""
-        require_whole(f"{self.node}.views", views, low=1, high=MOST_VIEWS)
-
-    def require_angles(self, name: str, angles_deg: object, *, limit: int) -> None:
-        """Raise ``UserError`` unless setting ``name`` is a list of angles in [-limit, limit] degrees."""
-        key = f"{self.node}.{name}"
-        require(
-            are_numbers(angles_deg, low=-limit, high=limit) and len(angles_deg) > 0,
-            key,
-            expected=f"at least one angle, each in [-{limit}, {limit}]",
-            got=angles_deg,
-        )
-
 
 @dataclass(frozen=True, kw_only=True)
 class PictureSettings(ViewSettings):
@@ -81,21 +70,14 @@ class PictureSettings(ViewSettings):
     Exporters, callbacks and metrics that render inherit these four settings and add their own angles.
     """
 
-    background: Sequence[float]  # RGB in [0, 1]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_color(f"{self.node}.background", self.background)
+    background: Color
 
 
 @dataclass(frozen=True, kw_only=True)
 class CutoutSettings(ViewSettings):
     """The same four settings for pictures that may be transparent where there is no object."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.is_transparent:
-            require_color(f"{self.node}.background", self.background, otherwise=f" or {TRANSPARENT}")
+    background: Annotated[Sequence[float] | str, partial(require_color, otherwise=TRANSPARENT)]
 
     @property
     def is_transparent(self) -> bool:

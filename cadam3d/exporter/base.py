@@ -4,9 +4,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from cadam3d.core.checks import require_choice
+from cadam3d.core.checks import Declared, one_of
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderFn, Subject
@@ -25,7 +25,7 @@ class Contents:
     triangles: int | None = None
 
 
-class Exporter(ABC):
+class Exporter(Declared, ABC):
     """Write one kind of file; a subclass is a frozen dataclass of settings.
 
     The class variables say what the rest of the program has to know about the kind of file.
@@ -111,18 +111,17 @@ def gaussians_in(gaussians: Gaussians, *, up: str | None, sh_degree: int) -> Con
 class AssetExporter(Exporter):
     """Write the Gaussians themselves as one file, in the axes that the user chooses, without a renderer."""
 
-    # Node of the configuration, such as "exporter.spz", with which error messages begin.
-    node: ClassVar[str]
     # Writes the file, given its path, the Gaussians and ``up``; a format with settings overrides ``write``.
     writer: ClassVar[Callable[..., None]]
-    uses_gaussforge: ClassVar[bool] = False
+    # Node of the configuration, such as "exporter.sog", whose format needs GaussForge.
+    gaussforge: ClassVar[str] = ""
 
-    up: str  # up axis of the file, one of UPS
+    up: Annotated[str, one_of(UPS)]  # axis of the file
 
     def __post_init__(self) -> None:
-        require_choice(f"{self.node}.up", self.up, UPS)
-        if self.uses_gaussforge:
-            require_gaussforge(self.node)
+        super().__post_init__()
+        if self.gaussforge:
+            require_gaussforge(self.gaussforge)
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
         """Write the file and return its path."""

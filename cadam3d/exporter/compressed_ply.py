@@ -11,7 +11,6 @@ from cadam3d.io.compressed_ply import write_compressed_ply
 class CompressedPlyExporter(AssetExporter):
     """Write ``asset.compressed.ply``; ``io/compressed_ply.py`` describes the layout and what is lost."""
 
-    node: ClassVar = "exporter.compressed_ply"
     files: ClassVar = ("asset.compressed.ply",)
     writer: ClassVar = write_compressed_ply
     loss: ClassVar = "rounds positions, scales and rotations to 10 or 11 bits, colours and opacities to 8"

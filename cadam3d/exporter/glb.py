@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from cadam3d.core.checks import require_choice
+from cadam3d.core.checks import one_of
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.exporter.base import AssetExporter
 from cadam3d.io.glb import COLORS, write_glb
@@ -14,15 +14,10 @@ from cadam3d.io.glb import COLORS, write_glb
 class GlbExporter(AssetExporter):
     """Write ``asset.glb`` with the extension ``KHR_gaussian_splatting`` (``io/glb.py``)."""
 
-    node: ClassVar = "exporter.glb"
     files: ClassVar = ("asset.glb",)
     hint: ClassVar = "needs a program that knows KHR_gaussian_splatting; for triangles type 'exporter=[mesh]'"
 
-    colors: str  # one of COLORS
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_choice("exporter.glb.colors", self.colors, tuple(COLORS))
+    colors: Annotated[str, one_of(COLORS)]
 
     def write(self, path: Path, gaussians: Gaussians) -> None:
         """Write the file atomically. Raises ``UserError`` if it cannot be written."""

@@ -1,11 +1,10 @@
 """HtmlExporter: one page that shows the asset in any browser, without a network."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from cadam3d.core.checks import require_color, require_range
+from cadam3d.core.checks import Color, Elevation, within
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderFn
 from cadam3d.exporter.base import Contents, Exporter, gaussians_in
@@ -24,15 +23,9 @@ class HtmlExporter(Exporter):
     hint: ClassVar = "opens in any browser, without a network"
 
     title: str | None  # None = UNTITLED
-    azimuth_deg: float  # 0 = front
-    elevation_deg: float  # in [-90, 90]
-    background: Sequence[float] | None  # RGB in [0, 1]; None = as light or dark as the reader's other pages
-
-    def __post_init__(self) -> None:
-        require_range("exporter.html.azimuth_deg", self.azimuth_deg, low=-360, high=360)
-        require_range("exporter.html.elevation_deg", self.elevation_deg, low=-90, high=90)
-        if self.background is not None:
-            require_color("exporter.html.background", self.background)
+    azimuth_deg: Annotated[float, within(low=-360, high=360)]  # 0 = front
+    elevation_deg: Elevation
+    background: Color | None  # None = as light or dark as the reader's other pages
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
         """Write the page and return its path."""

@@ -4,10 +4,10 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated
 
-from cadam3d.core.checks import require_choice
-from cadam3d.core.pictures import CutoutSettings
+from cadam3d.core.checks import each, one_of
+from cadam3d.core.pictures import CutoutSettings, Elevations, Views
 from cadam3d.core.rendering import Subject
 from cadam3d.exporter.pictures import KINDS, PictureExporter, captions_of, paint, paper_of
 from cadam3d.io.atomic import replacing_series
@@ -27,18 +27,9 @@ class ImagesExporter(CutoutSettings, PictureExporter):
     All pictures with such names in ``images`` are replaced, so that none of an earlier export is left.
     """
 
-    node: ClassVar[str] = "exporter.images"
-
-    views: int  # >= 1, per elevation
-    elevations_deg: Sequence[float]  # in [-90, 90]
-    kinds: Sequence[str]  # of KINDS
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.require_views(self.views)
-        self.require_angles("elevations_deg", self.elevations_deg, limit=90)
-        for kind in self.kinds:
-            require_choice("exporter.images.kinds", kind, KINDS)
+    views: Views  # per elevation
+    elevations_deg: Elevations
+    kinds: Annotated[Sequence[str], each(one_of(KINDS))]
 
     def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
         """Render and write view by view, so that memory does not grow with the number of views."""

@@ -11,9 +11,8 @@ from cadam3d.io.gaussforge import KSPLAT_SH_DEGREE, write_ksplat
 class KsplatExporter(AssetExporter):
     """Write ``asset.ksplat`` with the optional package gaussforge (``io/gaussforge.py``)."""
 
-    node: ClassVar = "exporter.ksplat"
     files: ClassVar = ("asset.ksplat",)
     writer: ClassVar = write_ksplat
-    uses_gaussforge: ClassVar = True
+    gaussforge: ClassVar = "exporter.ksplat"
     max_degree: ClassVar = KSPLAT_SH_DEGREE
     loss: ClassVar = "rounds colours and opacities to 8 bits"

@@ -3,9 +3,9 @@
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from cadam3d.core.checks import require_choice, require_whole, unless_none
+from cadam3d.core.checks import one_of, whole
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
@@ -31,19 +31,15 @@ class MeshExporter(SurfaceSettings, Exporter):
     loss: ClassVar = "a closed surface in place of Gaussians"
     sh_loss: ClassVar = "without view-dependent colours"
 
-    format: str  # one of FORMATS
-    up: str | None  # up axis of the file, one of UPS; None = USUAL_UP
-    texture: int | None  # pixels per side; None = vertex colours
-    textured_triangles: int  # at most, with a texture
+    format: Annotated[str, one_of(FORMATS)]
+    up: Annotated[str, one_of(UPS)] | None  # axis of the file; None = USUAL_UP
+    texture: Annotated[int, whole(low=64, high=8192)] | None  # pixels per side; None = vertex colours
+    textured_triangles: Annotated[int, whole(low=100, high=2**31)]  # at most, with a texture
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_choice("exporter.mesh.format", self.format, FORMATS)
-        unless_none(require_choice, "exporter.mesh.up", self.up, choices=UPS)
-        require_whole("exporter.mesh.textured_triangles", self.textured_triangles, low=100, high=2**31)
         if self.texture is None:
             return
-        require_whole("exporter.mesh.texture", self.texture, low=64, high=8192)
         if self.format in ("ply", "stl"):
             raise UserError(
                 f"exporter.mesh.texture: expected null with format={self.format}, which has no textures, "

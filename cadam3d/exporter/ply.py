@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from cadam3d.core.checks import require_choice
+from cadam3d.core.checks import one_of
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE
 from cadam3d.exporter.base import AssetExporter, Contents, gaussians_in
@@ -16,14 +16,9 @@ from cadam3d.io.run_folder import ASSET
 class PlyExporter(AssetExporter):
     """Write ``asset.ply`` in the de-facto 3DGS layout; ``io/ply.py`` lists what reads back bit for bit."""
 
-    node: ClassVar = "exporter.ply"
     files: ClassVar = (ASSET,)
 
-    pad_sh: int  # 0 to 3
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_choice("exporter.ply.pad_sh", self.pad_sh, range(MAX_DEGREE + 1))
+    pad_sh: Annotated[int, one_of(range(MAX_DEGREE + 1))]
 
     def write(self, path: Path, gaussians: Gaussians) -> None:
         """Write the file atomically. Raises ``UserError`` if it cannot be written."""

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from cadam3d.core.pictures import PictureSettings
+from cadam3d.core.pictures import Elevations, PictureSettings, Views
 from cadam3d.core.rendering import Subject
 from cadam3d.exporter.pictures import PictureExporter, captions_of, paper_of
 from cadam3d.io.caption import side_by_side
@@ -25,17 +25,11 @@ class PreviewExporter(PictureSettings, PictureExporter):
     square.
     """
 
-    node: ClassVar[str] = "exporter.preview"
     files: ClassVar = (PREVIEW,)
 
-    views: int  # >= 1, per elevation
-    elevations_deg: Sequence[float]  # in [-90, 90]
+    views: Views  # per elevation
+    elevations_deg: Elevations
     labels: bool
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.require_angles("elevations_deg", self.elevations_deg, limit=90)
-        self.require_views(self.views)
 
     def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
         """Render row by row and write the sheet."""

@@ -3,12 +3,12 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from jaxtyping import UInt8
 
-from cadam3d.core.checks import require_choice, require_range, require_whole
+from cadam3d.core.checks import one_of, require_whole, within
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderFn
@@ -34,14 +34,13 @@ class ProgressExporter(Exporter):
     # compares, has no single folder, and ``compare`` refuses it.
     run: str | Sequence[str] | None
     fps: int  # previews per second, in [1, 240]; for gif in [1, 50]
-    hold: float  # seconds that the last preview stays, in [0, 60]
-    codec: str  # one of CODECS
+    hold: Annotated[float, within(low=0, high=LONGEST_HOLD)]  # seconds that the last preview stays
+    codec: Annotated[str, one_of(CODECS)]
 
     def __post_init__(self) -> None:
-        require_choice("exporter.progress.codec", self.codec, CODECS)
+        super().__post_init__()
         high = FORMATS[f".{self.codec}"].most_fps
         require_whole("exporter.progress.fps", self.fps, low=1, high=high)
-        require_range("exporter.progress.hold", self.hold, low=0, high=LONGEST_HOLD)
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
         """Read the previews one by one and encode them; the Gaussians are not rendered."""

@@ -11,8 +11,7 @@ from cadam3d.io.gaussforge import write_sog
 class SogExporter(AssetExporter):
     """Write ``asset.sog`` with the optional package gaussforge (``io/gaussforge.py``)."""
 
-    node: ClassVar = "exporter.sog"
     files: ClassVar = ("asset.sog",)
     writer: ClassVar = write_sog
-    uses_gaussforge: ClassVar = True
+    gaussforge: ClassVar = "exporter.sog"
     loss: ClassVar = "rounds positions to 16 bits, and the rest to code books of 256 values"

@@ -11,7 +11,6 @@ from cadam3d.io.splat import write_splat
 class SplatExporter(AssetExporter):
     """Write ``asset.splat``, 32 bytes per Gaussian, without view-dependent colours (``io/splat.py``)."""
 
-    node: ClassVar = "exporter.splat"
     files: ClassVar = ("asset.splat",)
     writer: ClassVar = write_splat
     max_degree: ClassVar = 0

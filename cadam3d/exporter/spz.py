@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from cadam3d.core.checks import require_choice
+from cadam3d.core.checks import one_of
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.exporter.base import AssetExporter
 from cadam3d.io.gaussforge import require_gaussforge, write_spz4
@@ -15,16 +15,14 @@ from cadam3d.io.spz import write_spz
 class SpzExporter(AssetExporter):
     """Write ``asset.spz``: version 3 (``io/spz.py``), or version 4 with gaussforge (``io/gaussforge.py``)."""
 
-    node: ClassVar = "exporter.spz"
     files: ClassVar = ("asset.spz",)
     loss: ClassVar = "rounds positions to 24 bits, rotations to 10, colours, opacities and scales to 8"
     sh_loss: ClassVar = "view-dependent colours to 4 or 5"
 
-    version: int  # 3 or 4
+    version: Annotated[int, one_of((3, 4))]
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_choice("exporter.spz.version", self.version, (3, 4))
         if self.version == 4:
             require_gaussforge("exporter.spz.version")
 

@@ -3,15 +3,15 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import UInt8
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import fail, require, require_choice, require_range, require_whole
-from cadam3d.core.pictures import CutoutSettings
+from cadam3d.core.checks import Elevation, fail, one_of, require, require_whole, whole, within
+from cadam3d.core.pictures import CutoutSettings, Views
 from cadam3d.core.rendering import Subject
 from cadam3d.exporter.pictures import PictureExporter, captions_of, paint, paper_of
 from cadam3d.io.caption import side_by_side
@@ -30,27 +30,21 @@ VIEWS_AT_ONCE = 4  # bounds the memory of rendering for a video of any length
 class TurntableExporter(CutoutSettings, PictureExporter):
     """Write ``turntable.mp4``, ``.webm`` or ``.gif``: the camera circles the object, first at its front."""
 
-    node: ClassVar[str] = "exporter.turntable"
     files: ClassVar = (TURNTABLE, "turntable.webm", "turntable.gif")
     suffix_setting: ClassVar = "codec"
 
-    views: int  # in [1, 100000], frames
-    turns: float  # in [-100, 100]; negative = the other way round
-    elevation_deg: float  # in [-90, 90]
+    size: Annotated[int, whole(low=1, high=LARGEST)]  # pixels
+    views: Views  # frames
+    turns: Annotated[float, within(low=-MOST_TURNS, high=MOST_TURNS)]  # negative = the other way round
+    elevation_deg: Elevation
     fps: int  # frames per second, in [1, 240]; for gif in [1, 50]
-    codec: str  # one of CODECS
-    beside: str  # depth, alpha, normal or none
+    codec: Annotated[str, one_of(CODECS)]
+    beside: Annotated[str, one_of(("depth", "alpha", "normal", "none"))]
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_views(self.views)
-        require_range("exporter.turntable.turns", self.turns, low=-MOST_TURNS, high=MOST_TURNS)
-        require_range("exporter.turntable.elevation_deg", self.elevation_deg, low=-90, high=90)
-        require_choice("exporter.turntable.codec", self.codec, CODECS)
         kind = FORMATS[f".{self.codec}"]
         require_whole("exporter.turntable.fps", self.fps, low=1, high=kind.most_fps)
-        require_choice("exporter.turntable.beside", self.beside, ("depth", "alpha", "normal", "none"))
-        require_whole("exporter.turntable.size", self.size, low=1, high=LARGEST)
         if self.is_transparent and kind.transparent_pixels is None:
             expected, example = "webm, because the background is transparent", "exporter.turntable.codec=webm"
             raise fail("exporter.turntable.codec", expected=expected, got=self.codec, example=example)

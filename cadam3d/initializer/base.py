@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import torch
 
+from cadam3d.core.checks import Declared
 from cadam3d.core.gaussians import Gaussians
 
 
@@ -19,7 +20,7 @@ class Beginning:
     note: str | None = None
 
 
-class Initializer(ABC):
+class Initializer(Declared, ABC):
     """Builds the initial Gaussians. Holds frozen hyper-parameters."""
 
     @abstractmethod

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -13,17 +13,17 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from trimesh.resolvers import FilePathResolver
 
-from cadam3d.core.checks import require_choice, require_color
+from cadam3d.core.checks import Color, one_of
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.points import (
     FromObject,
     PointCloud,
+    Rows,
     found_file,
     one_color,
     points_on_surface,
-    require_count,
 )
 from cadam3d.io.frames import points_to_world, turned_points
 from cadam3d.io.gltf import linear, srgb
@@ -48,15 +48,9 @@ class Mesh(FromObject):
     """
 
     path: str
-    up: str  # one of UPS
-    count: int
-    color: Sequence[float]  # RGB in [0, 1]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_count(self.count)
-        require_choice("initializer.up", self.up, UPS)
-        require_color("initializer.color", self.color)
+    up: Annotated[str, one_of(UPS)]
+    count: Rows
+    color: Color
 
     def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
         """Return Gaussians on ``device`` that cover the surface with equal density.

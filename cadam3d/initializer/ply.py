@@ -1,23 +1,25 @@
 """Ply: starts from a file of Gaussians, or from a PLY file with a cloud of coloured points."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_choice, require_color, require_whole, unless_none
+from cadam3d.core.checks import Color, Count, one_of, require
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.points import (
+    Copies,
     FromObject,
     PointCloud,
+    Radius,
+    ReplicateLaw,
     found_file,
     one_color,
     replicated,
-    require_copies,
     rows_of,
 )
 from cadam3d.io.asset_file import PLY, file_format, read_gaussians, say_assumed
@@ -41,19 +43,12 @@ class Ply(FromObject):
     """
 
     path: str
-    up: str | None  # one of UPS
-    count: int | None  # largest number of rows
-    replicate: int  # Gaussians per point
-    replicate_radius: float  # world units
-    replicate_law: str  # one of REPLICATE_LAWS
-    color: Sequence[float]  # RGB in [0, 1]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        unless_none(require_whole, "initializer.count", self.count, low=1)
-        unless_none(require_choice, "initializer.up", self.up, choices=UPS)
-        require_copies(self.replicate, self.replicate_radius, self.replicate_law)
-        require_color("initializer.color", self.color)
+    up: Annotated[str, one_of(UPS)] | None
+    count: Count | None  # largest number of rows
+    replicate: Copies  # Gaussians per point
+    replicate_radius: Radius  # world units
+    replicate_law: ReplicateLaw
+    color: Color
 
     def build(self, prompt: str, generator: torch.Generator, device: torch.device) -> Gaussians:
         """Return the Gaussians of the file, or Gaussians at its points, on ``device``.

@@ -4,13 +4,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_choice, require_range, require_whole, unless_none
+from cadam3d.core.checks import Positive, one_of, require, whole, within
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE, rgb_to_sh0
 from cadam3d.initializer.base import Initializer
@@ -25,6 +26,11 @@ SMALLEST = 1e-4  # world units
 SCALE_LAWS = ("mean", "rms")
 # How points are drawn in a ball, see :func:`replicated`.
 REPLICATE_LAWS = ("even", "polar")
+# No machine can train more Gaussians.
+Rows = Annotated[int, whole(low=1, high=100_000_000)]
+Copies = Annotated[int, whole(low=1, high=1000)]
+Radius = Annotated[float, within(above=0, high=1)]
+ReplicateLaw = Annotated[str, one_of(REPLICATE_LAWS)]
 
 
 @dataclass(frozen=True)
@@ -42,16 +48,10 @@ class PointCloud:
 class FromPoints(Initializer):
     """Base of the initializers that put round Gaussians at points."""
 
-    scale: float | None  # world units
-    scale_law: str  # one of SCALE_LAWS
-    opacity: float  # in (0, 1)
-    sh_degree: int | None  # 0 to 3
-
-    def __post_init__(self) -> None:
-        unless_none(require_range, "initializer.scale", self.scale, above=0)
-        require_choice("initializer.scale_law", self.scale_law, SCALE_LAWS)
-        require_range("initializer.opacity", self.opacity, above=0, below=1)
-        require_whole("initializer.sh_degree", self.sh_degree or 0, low=0, high=MAX_DEGREE)
+    scale: Positive | None  # world units
+    scale_law: Annotated[str, one_of(SCALE_LAWS)]
+    opacity: Annotated[float, within(above=0, below=1)]
+    sh_degree: Annotated[int, whole(low=0, high=MAX_DEGREE)] | None
 
     def gaussians_at(self, cloud: PointCloud, device: torch.device) -> Gaussians:
         """Return round Gaussians on ``device`` that have the same colour from every side.
@@ -77,17 +77,14 @@ class FromPoints(Initializer):
 class FromObject(FromPoints):
     """Base of the initializers that move an object of its own size and front into the world."""
 
-    turn_deg: int  # one of TURNS
-    radius: float | None  # world units
-    factor: float | None  # world units per unit of the object
-    lift: float  # world units
+    turn_deg: Annotated[int, one_of(TURNS)]
+    radius: Radius | None  # world units
+    factor: Annotated[float, within(above=0, high=1000)] | None  # world units per unit of the object
+    lift: Annotated[float, within(low=-1, high=1)]  # world units
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_choice("initializer.turn_deg", self.turn_deg, TURNS)
-        unless_none(require_range, "initializer.radius", self.radius, above=0, high=1)
         if self.factor is not None:
-            require_range("initializer.factor", self.factor, above=0, high=1000)
             require(
                 self.radius is None,
                 "initializer.radius",
@@ -95,7 +92,6 @@ class FromObject(FromPoints):
                 got=self.radius,
                 example="initializer.radius=null",
             )
-        require_range("initializer.lift", self.lift, low=-1, high=1)
 
     def placed(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], float]:
         """Return points of the object, which is upright, in the world, and the factor of their distances.
@@ -232,15 +228,3 @@ def found_file(path: str) -> Path:
     example = "initializer.path=FILE"
     require(has_file(found), "initializer.path", expected="a file", got=path, example=example)
     return found
-
-
-def require_count(count: int) -> None:
-    """Raise ``UserError`` unless ``count`` is a number of Gaussians that some machine can train."""
-    require_whole("initializer.count", count, low=1, high=100_000_000)
-
-
-def require_copies(replicate: int, replicate_radius: object, replicate_law: object) -> None:
-    """Raise ``UserError`` unless ``replicate`` is at least 1, its radius in (0, 1] and its law known."""
-    require_whole("initializer.replicate", replicate, low=1, high=1000)
-    require_range("initializer.replicate_radius", replicate_radius, above=0, high=1)
-    require_choice("initializer.replicate_law", replicate_law, REPLICATE_LAWS)

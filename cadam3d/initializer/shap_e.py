@@ -3,26 +3,28 @@
 import gc
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float, Int
 from kornia.color import linear_rgb_to_rgb
 from torch import Tensor
 
-from cadam3d.core.checks import require_choice, require_color, require_range, require_whole, unless_none
+from cadam3d.core.checks import Color, Positive, Share, one_of, whole, within
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Beginning, Initializer
 from cadam3d.initializer.points import (
+    Copies,
     FromObject,
     PointCloud,
+    Radius,
+    ReplicateLaw,
+    Rows,
     grown,
     one_color,
     points_on_surface,
     replicated,
-    require_copies,
-    require_count,
 )
 from cadam3d.io.frames import turned_points
 from cadam3d.io.pretrained import DTYPES, ModelSource, Pretrained
@@ -56,35 +58,21 @@ class ShapE(FromObject):
     ids: Sequence[str]  # on the hub
     revision: str | None  # on the hub
     variant: str | None  # of weight files
-    dtype: str  # auto or one of DTYPES
+    dtype: Annotated[str, one_of(("auto", *DTYPES))]
     prompt: str | None
-    steps: int
-    guidance_scale: float  # >= 1
-    grid_size: int  # cells per side
-    count: int | None
-    grow_points: int  # candidates
-    grow_distance: float  # Shap-E's units
-    grow_noise: float  # in [0, 1]
-    tone: str  # one of TONES
-    color: Sequence[float] | None  # RGB in [0, 1]
-    replicate: int  # Gaussians per point
-    replicate_radius: float  # world units
-    replicate_law: str  # one of REPLICATE_LAWS
+    steps: Annotated[int, whole(low=1, high=1024)]
+    guidance_scale: Annotated[float, within(low=1)]
+    grid_size: Annotated[int, whole(low=2, high=1024)]  # cells per side
+    count: Rows | None
+    grow_points: Annotated[int, whole(low=0, high=100_000_000)]  # candidates
+    grow_distance: Positive  # Shap-E's units
+    grow_noise: Share
+    tone: Annotated[str, one_of(TONES)]
+    color: Color | None
+    replicate: Copies  # Gaussians per point
+    replicate_radius: Radius  # world units
+    replicate_law: ReplicateLaw
     fallback: Initializer | None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_choice("initializer.dtype", self.dtype, ("auto", *DTYPES))
-        require_whole("initializer.steps", self.steps, low=1, high=1024)
-        require_range("initializer.guidance_scale", self.guidance_scale, low=1)
-        require_whole("initializer.grid_size", self.grid_size, low=2, high=1024)
-        require_count(1 if self.count is None else self.count)
-        require_whole("initializer.grow_points", self.grow_points, low=0, high=100_000_000)
-        require_range("initializer.grow_distance", self.grow_distance, above=0)
-        require_range("initializer.grow_noise", self.grow_noise, low=0, high=1)
-        require_choice("initializer.tone", self.tone, TONES)
-        unless_none(require_color, "initializer.color", self.color)
-        require_copies(self.replicate, self.replicate_radius, self.replicate_law)
 
     def begin(self, prompt: str, generator: torch.Generator, device: torch.device) -> Beginning:
         """Return Shap-E's Gaussians, or the Gaussians of ``fallback`` with a note if Shap-E fails.

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
+from cadam3d.core.checks import Declared
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.number import Number
 from cadam3d.core.rendering import RenderFn, Truth
@@ -37,13 +38,13 @@ class Measurement:
     warnings: tuple[str, ...] = ()  # for the user, each with what to do about it
 
 
-class Metric(ABC):
+class Metric(Declared, ABC):
     """Interface of all metrics. A subclass is a frozen dataclass of its settings."""
 
     # What the metric can measure. Tables, reports and ``select=`` read this from the files of a run.
     numbers: ClassVar[tuple[Number, ...]] = ()
 
-    def prepare(self) -> None:  # noqa: B027 (most metrics need nothing)
+    def prepare(self) -> None:
         """Raise ``UserError`` if something is missing that the metric needs, such as the files of a model.
 
         This is called before a run begins and before assets are measured, so that nothing is done in vain.

@@ -1,14 +1,15 @@
 """Fidelity: how close the renders are to the true images, if those are known."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require_whole
+from cadam3d.core.checks import whole
 from cadam3d.core.number import Number
+from cadam3d.core.pictures import MOST_PIXELS
 from cadam3d.core.rendering import RenderFn, Truth
 from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.held_out import HeldOutSettings
@@ -39,7 +40,6 @@ class Fidelity(HeldOutSettings, Metric):
     the asset is compared with every mode over all views, and only the mode with the best mean PSNR counts.
     """
 
-    node: ClassVar[str] = "metric.fidelity"
     numbers: ClassVar[tuple[Number, ...]] = (
         PSNR,
         replace(PSNR, name="psnr_min", label="PSNR of the worst view", preference=None),
@@ -65,9 +65,7 @@ class Fidelity(HeldOutSettings, Metric):
         PSNR_START,
     )
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_whole("metric.fidelity.size", self.size, low=SSIM_WINDOW)
+    size: Annotated[int, whole(low=SSIM_WINDOW, high=MOST_PIXELS)]
 
     def measure(self, measurand: Measurand) -> Measurement:
         """Return PSNR, SSIM and the mode that they belong to; nothing if there are no true images.

@@ -1,6 +1,6 @@
 """HeldOutSettings: the views from which metrics look at an asset, none of which a turntable shows."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.pictures import PictureSettings
+from cadam3d.core.pictures import Elevations, PictureSettings, Views
 
 # Views that are compared at once. This bounds the memory, because there is a true image per mode and view.
 VIEWS_AT_ONCE = 4
@@ -18,13 +18,8 @@ VIEWS_AT_ONCE = 4
 class HeldOutSettings(PictureSettings):
     """The settings of pictures, and rings of azimuths at several elevations."""
 
-    views: int  # >= 1, per elevation
-    elevations_deg: Sequence[float]  # in [-90, 90]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.require_views(self.views)
-        self.require_angles("elevations_deg", self.elevations_deg, limit=90)
+    views: Views  # per elevation
+    elevations_deg: Elevations
 
     def cameras(self) -> Cameras:
         """Return the held-out views.

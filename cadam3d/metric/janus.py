@@ -15,14 +15,14 @@ and the asset has as many fronts as there are separate maxima of "front" over th
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
-from cadam3d.core.checks import require_choice, require_range, require_whole
+from cadam3d.core.checks import Elevation, one_of, whole
 from cadam3d.core.number import Number
 from cadam3d.metric.base import Measurand, Measurement
 from cadam3d.metric.clip import ClipMetric, load_clip
@@ -72,14 +72,9 @@ class Janus(ClipMetric):
     )
     kind: ClassVar[str] = "clip"
 
-    by: str  # auto | truth | model
-    views: int  # azimuths that the model sees
-    elevation_deg: float  # of these views, in [-90, 90]
-
-    def __post_init__(self) -> None:
-        require_choice("metric.janus.by", self.by, WAYS)
-        require_whole("metric.janus.views", self.views, low=6, high=MOST_VIEWS)
-        require_range("metric.janus.elevation_deg", self.elevation_deg, low=-90, high=90)
+    by: Annotated[str, one_of(WAYS)]
+    views: Annotated[int, whole(low=6, high=MOST_VIEWS)]  # azimuths that the model sees
+    elevation_deg: Elevation  # of these views
 
     def prepare(self) -> None:
         """Find the files of the model if ``by=model``. With ``by=auto``, the truth may replace it."""

@@ -1,12 +1,12 @@
 """MeshMetric: how close the surface of an asset is to the true surface, if that is known."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from cadam3d.core.checks import require_range, require_whole
+from cadam3d.core.checks import whole, within
 from cadam3d.core.mesh.surface import SurfaceSettings, areas
 from cadam3d.core.number import Number
 from cadam3d.core.rendering import Triangles
@@ -54,15 +54,9 @@ class MeshMetric(SurfaceSettings, Metric):
         replace(FSCORE, name="mesh_recall", label="recall of the mesh"),
     )
 
-    threshold: float  # world units
-    samples: int
-    seed: int
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_range("metric.mesh.threshold", self.threshold, above=0, high=10)
-        require_whole("metric.mesh.samples", self.samples, low=100, high=10_000_000)
-        require_whole("metric.mesh.seed", self.seed, low=0, high=2**62)
+    threshold: Annotated[float, within(above=0, high=10)]  # world units
+    samples: Annotated[int, whole(low=100, high=10_000_000)]
+    seed: Annotated[int, whole(low=0, high=2**62)]
 
     def measure(self, measurand: Measurand) -> Measurement:
         """Return the four numbers of the class; nothing if the true shape is not known.

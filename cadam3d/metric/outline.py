@@ -54,7 +54,6 @@ class Outline(HeldOutSettings, Metric):
     and among equal ones that with the smallest ``colour_error``.
     """
 
-    node: ClassVar[str] = "metric.outline"
     numbers: ClassVar[tuple[Number, ...]] = (IOU, IOU_START, COLOUR_ERROR)
 
     def measure(self, measurand: Measurand) -> Measurement:

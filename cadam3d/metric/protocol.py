@@ -9,15 +9,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, orbit
-from cadam3d.core.checks import require, require_range, require_whole
-from cadam3d.core.pictures import PictureSettings
+from cadam3d.core.checks import each, require, whole, within
+from cadam3d.core.pictures import Elevations, PictureSettings, Views
 from cadam3d.core.rendering import RenderFn
 
 # Views that are rendered and scored at once, which bounds the memory.
@@ -29,7 +29,6 @@ PROMPT = "{}"  # the place of the prompt in a text
 class Protocol(PictureSettings, ABC):
     """Views, pictures, text and models of an evaluation. The subclasses place the cameras."""
 
-    node: ClassVar[str] = "protocol"
     is_mean: ClassVar[bool]  # whether the number is the mean of the values, so that it has an interval
 
     name: str
@@ -71,13 +70,8 @@ class RingProtocol(Protocol):
 
     is_mean: ClassVar[bool] = True
 
-    views: int  # >= 1, per elevation
-    elevations_deg: Sequence[float]  # in [-90, 90]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.require_views(self.views)
-        self.require_angles("elevations_deg", self.elevations_deg, limit=90)
+    views: Views  # per elevation
+    elevations_deg: Elevations
 
     @cached_property
     def cameras(self) -> Cameras:
@@ -102,17 +96,10 @@ class SphereProtocol(Protocol):
 
     is_mean: ClassVar[bool] = False
 
-    subdivisions: int  # 0 to 4; each divides every triangle into four
-    # More fields of view beside ``fov_y_deg``, each in (0, 180) degrees.
-    other_fovs_y_deg: Sequence[float]
-    rounds: int  # of smoothing, >= 0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_whole("protocol.subdivisions", self.subdivisions, low=0, high=4)
-        require_whole("protocol.rounds", self.rounds, low=0, high=100)
-        for each in self.other_fovs_y_deg:
-            require_range("protocol.other_fovs_y_deg", each, above=0, below=180)
+    subdivisions: Annotated[int, whole(low=0, high=4)]  # each divides every triangle into four
+    # More fields of view beside ``fov_y_deg``.
+    other_fovs_y_deg: Annotated[Sequence[float], each(within(above=0, below=180))]
+    rounds: Annotated[int, whole(low=0, high=100)]  # of smoothing
 
     @cached_property
     def cameras(self) -> Cameras:

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require, require_choice
+from cadam3d.core.checks import one_of, require
 from cadam3d.core.number import Number
 from cadam3d.io.image import to_uint8
 from cadam3d.io.pretrained import DTYPES
@@ -76,12 +76,12 @@ class Vqa(ModelMetric):
     kind: ClassVar[str] = "vqa"
 
     question: str  # {} is the text of the protocol
-    dtype: str  # of the weights
+    dtype: Annotated[str, one_of(DTYPES)]  # of the weights
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         is_question = self.question.count(PLACE) == 1
         require(is_question, f"{self.node}.question", expected=f"a text with {PLACE} once", got=self.question)
-        require_choice(f"{self.node}.dtype", self.dtype, tuple(DTYPES))
 
     def source(self) -> TransformerSource:
         """Return the place of the model. Raises ``UserError`` if neither metric nor protocol names one."""

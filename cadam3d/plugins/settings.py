@@ -33,4 +33,4 @@ class CAdamSettings:
             return CAdam(**chosen, reset_min_age=reset_min_age)
         except UserError as error:
             # In Python a setting is a keyword argument, without the name of its group.
-            raise UserError(str(error).replace("densifier.", "")) from None
+            raise UserError(str(error).replace("densifier.", "").replace("CAdam.", "")) from None

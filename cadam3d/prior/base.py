@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
+from cadam3d.core.checks import Declared
 from cadam3d.core.rendering import Truth
 from cadam3d.prior.path import Latents, NoisePath, PerView, Prediction
 
@@ -56,7 +57,7 @@ def amount(count: int) -> str:
     return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{count / 2**20:.0f} MiB"
 
 
-class DiffusionPrior(ABC):
+class DiffusionPrior(Declared, ABC):
     """A denoiser of images. ``t`` is in [0, 1]: 0 is clean and 1 is noise, for diffusion and flow models.
 
     ``noise_path`` is how the model mixes images with noise. It is declared as an attribute and not as a

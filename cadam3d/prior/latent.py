@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -19,7 +19,7 @@ from torch.nn import functional as F  # noqa: N812  (the usual name)
 from torch.utils.checkpoint import checkpoint
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import require, require_choice, require_whole, unless_none
+from cadam3d.core.checks import Count, one_of, require
 from cadam3d.core.errors import UserError
 from cadam3d.io.cache import default_cache_dir
 from cadam3d.io.pretrained import DTYPES, VOCABULARY, ModelSource, Pretrained
@@ -105,12 +105,12 @@ class LatentPrior(DiffusionPrior):
     variant: str | None  # of weight files
     prompting: Prompting
     size: int | None  # pixels per side
-    noise_levels: str  # one of LEVELS
-    dtype: str  # auto or one of DTYPES
-    vae_dtype: str  # auto, bfloat16 or float32
-    micro_batch: int | None  # images
+    noise_levels: Annotated[str, one_of(LEVELS)]
+    dtype: Annotated[str, one_of(("auto", *DTYPES))]
+    vae_dtype: Annotated[str, one_of(("auto", "bfloat16", "float32"))]
+    micro_batch: Count | None  # images
     compile: bool
-    text_device: str  # auto or cpu
+    text_device: Annotated[str, one_of(("auto", "cpu"))]
     cache_dir: str | None  # folder
 
     kinds: ClassVar[tuple[str, ...]]  # pipeline classes that this prior can use
@@ -120,15 +120,11 @@ class LatentPrior(DiffusionPrior):
     upcasts: ClassVar[bool]  # whether the autoencoder overflows in float16
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.size is not None:
             unit = 2 * FACTOR
             is_possible = self.size > 0 and self.size % unit == 0
             require(is_possible, "prior.size", expected=f"a multiple of {unit}", got=self.size)
-        require_choice("prior.noise_levels", self.noise_levels, LEVELS)
-        require_choice("prior.dtype", self.dtype, ("auto", *DTYPES))
-        require_choice("prior.vae_dtype", self.vae_dtype, ("auto", "bfloat16", "float32"))
-        unless_none(require_whole, "prior.micro_batch", self.micro_batch, low=1)
-        require_choice("prior.text_device", self.text_device, ("auto", "cpu"))
 
     # --- methods that a family of models implements ---------------------------------------------------------
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import require, require_range
+from cadam3d.core.checks import Share, require
 from cadam3d.core.errors import UserError
 from cadam3d.io.pretrained import Pretrained
 from cadam3d.prior.base import MemoryEstimate
@@ -48,7 +48,7 @@ class MVDream(StableDiffusion):
     ``camera=multiview``.
     """
 
-    rescale: float  # in [0, 1]
+    rescale: Share
     tokenizer: str  # a folder or a name on the hub
 
     kinds: ClassVar = ("MVDreamPipeline", "StableDiffusionPipeline")
@@ -62,7 +62,6 @@ class MVDream(StableDiffusion):
             got=self.micro_batch,
             example=f"prior.micro_batch={VIEWS}",
         )
-        require_range("prior.rescale", self.rescale, low=0, high=1)
 
     @cached_property
     def found(self) -> Pretrained:

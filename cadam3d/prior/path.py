@@ -8,13 +8,14 @@ DDIM inversion are the same call: ``mix(prediction.clean, prediction.noise, t)``
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require_range, require_whole
+from cadam3d.core.checks import Count, Declared, Positive, require_range, within
 from cadam3d.core.device import upload
 
 # Bisections until an interval of length 1 reaches the resolution of double precision.
@@ -36,7 +37,7 @@ class Prediction:
     velocity: Latents  # see NoisePath.velocity
 
 
-class NoisePath(ABC):
+class NoisePath(Declared, ABC):
     """A family of mixtures of a clean image with standard normal noise."""
 
     @abstractmethod
@@ -107,13 +108,12 @@ class DDPM(NoisePath):
     training of these models. The defaults are constants of the models, not settings.
     """
 
-    train_steps: int = 1000
-    beta_start: float = 0.00085
+    train_steps: Count = 1000
+    beta_start: Annotated[float, within(above=0, below=1)] = 0.00085
     beta_end: float = 0.012
 
     def __post_init__(self) -> None:
-        require_whole("prior.noise_path.train_steps", self.train_steps, low=1)
-        require_range("prior.noise_path.beta_start", self.beta_start, above=0, below=1)
+        super().__post_init__()
         require_range("prior.noise_path.beta_end", self.beta_end, low=self.beta_start, below=1)
 
     def a(self, t: PerView) -> PerView:
@@ -153,10 +153,7 @@ class RectifiedFlow(NoisePath):
     shift 3 (Esser et al. 2024, sec. 5.3.2). A shift of 1 does not change t.
     """
 
-    shift: float = 1.0
-
-    def __post_init__(self) -> None:
-        require_range("prior.noise_path.shift", self.shift, above=0)
+    shift: Positive = 1.0
 
     def a(self, t: PerView) -> PerView:
         """Return 1 - sigma."""

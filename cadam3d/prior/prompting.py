@@ -8,13 +8,14 @@ texts. Azimuth 0 is the front. This module is independent of networks: a :class:
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import require, require_choice, require_range
+from cadam3d.core.checks import Declared, Elevation, one_of, require, within
 from cadam3d.prior.path import PerView
 
 FRONT, SIDE, BACK, OVERHEAD = range(4)
@@ -38,7 +39,7 @@ class Mix:
     strengths: Float[Tensor, "v m"]  # of the repulsion, <= 0
 
 
-class Prompting(ABC):
+class Prompting(Declared, ABC):
     """Decides how a prompt describes views. Holds frozen hyper-parameters."""
 
     @abstractmethod
@@ -70,14 +71,12 @@ class Discrete(Prompting):
     A view above ``overhead_deg`` is overhead, whatever its azimuth.
     """
 
-    front_deg: float
-    back_deg: float
-    overhead_deg: float
+    front_deg: Annotated[float, within(low=0, high=180)]
+    back_deg: Annotated[float, within(low=0, high=180)]
+    overhead_deg: Elevation
 
     def __post_init__(self) -> None:
-        require_range("prompting.front_deg", self.front_deg, low=0, high=180)
-        require_range("prompting.back_deg", self.back_deg, low=0, high=180)
-        require_range("prompting.overhead_deg", self.overhead_deg, low=-90, high=90)
+        super().__post_init__()
         require(
             self.front_deg + self.back_deg <= 180,
             "prompting.back_deg",
@@ -104,12 +103,11 @@ class Discrete(Prompting):
 class Compass(Prompting):
     """One of 24 texts per view: eight sides, each from below, at the height of the object, and from above."""
 
-    below_deg: float
-    above_deg: float
+    below_deg: Elevation
+    above_deg: Elevation
 
     def __post_init__(self) -> None:
-        require_range("prompting.below_deg", self.below_deg, low=-90, high=90)
-        require_range("prompting.above_deg", self.above_deg, low=-90, high=90)
+        super().__post_init__()
         require(
             self.below_deg <= self.above_deg,
             "prompting.above_deg",
@@ -167,13 +165,8 @@ class PerpNeg(Prompting):
     nothing is repelled from them.
     """
 
-    curve: str  # lucid or threestudio
-    overhead_deg: float | None
-
-    def __post_init__(self) -> None:
-        require_choice("prompting.curve", self.curve, ("lucid", "threestudio"))
-        if self.overhead_deg is not None:
-            require_range("prompting.overhead_deg", self.overhead_deg, low=-90, high=90)
+    curve: Annotated[str, one_of(("lucid", "threestudio"))]
+    overhead_deg: Elevation | None
 
     def texts(self, prompt: str) -> list[str]:
         """Return the prompt with each of the four suffixes."""

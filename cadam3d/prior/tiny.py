@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (the usual name)
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import require_choice, require_whole
+from cadam3d.core.checks import one_of, whole
 from cadam3d.core.device import upload
 from cadam3d.prior.base import Condition, DiffusionPrior, PromptEmbedding
 from cadam3d.prior.path import Latents, NoisePath, PerView, Prediction
@@ -58,17 +59,11 @@ class Tiny(DiffusionPrior):
     Images of 8 x 8 pixels or more, with even or odd sides, are averaged down to three channels in [-1, 1].
     """
 
-    predicts: str  # noise or velocity
+    predicts: Annotated[str, one_of(("noise", "velocity"))]
     noise_path: NoisePath
-    width: int  # channels
-    downscale: int  # pixels per side
-    seed: int
-
-    def __post_init__(self) -> None:
-        require_choice("prior.predicts", self.predicts, ("noise", "velocity"))
-        require_choice("prior.width", self.width, range(16, 49, GROUPS))
-        require_choice("prior.downscale", self.downscale, range(1, 9))
-        require_whole("prior.seed", self.seed, low=0, high=2**62)
+    width: Annotated[int, one_of(range(16, 49, GROUPS))]  # channels
+    downscale: Annotated[int, one_of(range(1, 9))]  # pixels per side
+    seed: Annotated[int, whole(low=0, high=2**62)]
 
     @cached_property
     def network(self) -> "TinyUNet":

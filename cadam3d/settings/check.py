@@ -143,7 +143,8 @@ def _require(value: Any, declared: Any, key: str) -> None:
         return
     types = [each for each in members if each not in classes]
     plain, expected = _plain(value, resolve=True), _in_words(members)
-    if types and _is_of_type(plain, reduce(or_, types)):
+    is_plain = object in types or not _is_described(value)
+    if types and is_plain and _is_of_type(plain, reduce(or_, types)):
         if declared is Any or _is_usable(plain):
             return
         expected += " without control characters" if isinstance(plain, str) else " below 2^63"

@@ -368,12 +368,3 @@ def test_a_record_that_this_program_has_not_written_begins_a_new_run(content, tm
     name, recorded = known_run(path)
     assert len(name) == 16
     assert recorded == 0
-
-
-def test_wrong_values_name_their_key():
-    with pytest.raises(UserError, match=r"^callback\.wandb\.mode: expected one of auto\|offline"):
-        tracker(mode="online")
-    with pytest.raises(UserError, match=r"^callback\.wandb\.timeout: "):
-        tracker(timeout=0)
-    with pytest.raises(UserError, match=r"^callback\.tensorboard\.every: "):
-        TensorBoard(every=0)

@@ -5,7 +5,8 @@ import math
 import pytest
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.schedule import Linear, LogLinear, Steps, as_schedule, require_scheduled
+from cadam3d.core.schedule import Linear, LogLinear, Steps, as_schedule
+from cadam3d.densifier.random import RandomGrowth
 
 
 @pytest.mark.parametrize("kind", [Linear, LogLinear])
@@ -35,12 +36,12 @@ def test_a_number_is_a_constant_schedule_and_a_schedule_is_itself():
 @pytest.mark.parametrize(
     ("build", "key"),
     [
-        (lambda: Linear(start=0, end=1, steps=0), "schedule.steps"),
-        (lambda: LogLinear(start=1, end=1, steps=0), "schedule.steps"),
-        (lambda: LogLinear(start=0, end=1, steps=5), "schedule.start"),
-        (lambda: LogLinear(start=1, end=-1, steps=5), "schedule.end"),
-        (lambda: Steps(values=[1, 2], milestones=[]), "schedule.values"),
-        (lambda: Steps(values=[1, 2, 3], milestones=[20, 10]), "schedule.values"),
+        (lambda: Linear(start=0, end=1, steps=0), r"\.steps"),
+        (lambda: LogLinear(start=1, end=1, steps=0), r"\.steps"),
+        (lambda: LogLinear(start=0, end=1, steps=5), r"\.start"),
+        (lambda: LogLinear(start=1, end=-1, steps=5), r"\.end"),
+        (lambda: Steps(values=[1, 2], milestones=[]), r"\.values"),
+        (lambda: Steps(values=[1, 2, 3], milestones=[20, 10]), r"\.values"),
     ],
 )
 def test_impossible_schedules_name_the_key(build, key):
@@ -49,14 +50,8 @@ def test_impossible_schedules_name_the_key(build, key):
 
 
 @pytest.mark.parametrize(
-    "value", [-1, 2.0, True, math.nan, Linear(start=1, end=-1, steps=10), Linear(start=2, end=1, steps=10)]
+    "share", [-1, 2.0, True, math.nan, Linear(start=1, end=-1, steps=10), Linear(2, 1, 10)]
 )
-def test_numbers_and_schedules_that_start_or_end_outside_are_refused(value):
-    with pytest.raises(UserError, match=r"key: expected a number >= 0 and <= 1, got .*\.$"):
-        require_scheduled("key", value, low=0, high=1)
-
-
-@pytest.mark.parametrize("value", [None, "0.5", [0.5], {"start": 1.0}])
-def test_other_values_are_refused(value):
-    with pytest.raises(UserError, match="key: expected a number or a schedule, got"):
-        require_scheduled("key", value, low=0)
+def test_numbers_and_schedules_that_start_or_end_outside_are_refused(share):
+    with pytest.raises(UserError, match=r"^RandomGrowth\.share: expected a number >= 0 and < 1, got .*\.$"):
+        RandomGrowth(share=share)

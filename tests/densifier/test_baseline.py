@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from cadam3d.core.edit import RowEdit
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.schedule import Linear, as_schedule
 from cadam3d.densifier.base import GradientSignal
@@ -175,18 +174,3 @@ def test_an_empty_scene_has_empty_masks_and_no_statistics():
     state = baseline().observe(baseline().init_state(0, CPU), signal(torch.zeros(2, 0, 2)))
     assert baseline().select(state, STEP, DRAWS).shape == (0,)
     assert baseline().statistics(state, STEP) == {}
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("tau_pos", 0.0),
-        ("tau_pos", Linear(start=1e-4, end=0.0, steps=9)),
-        ("views", "first"),
-        ("grad_multiplier", 0.0),
-        ("screen_px", 0.0),
-    ],
-)
-def test_an_impossible_value_is_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"densifier\.{key}"):
-        baseline(**{key: value})

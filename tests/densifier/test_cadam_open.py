@@ -100,26 +100,11 @@ def test_the_reset_can_have_its_own_threshold():
 
 
 @pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("tau_m", -1.0),
-        ("invisible", "maybe"),
-        ("grad_norm", "max"),
-        ("tau_reset", -0.1),
-    ],
-)
-def test_an_impossible_value_of_an_open_choice_is_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"densifier\.{key}"):
-        open_cadam(**{key: value})
-
-
-@pytest.mark.parametrize(
     ("changes", "key"),
     [
         ({"tau_reset": 0.1, "reset": "all"}, "tau_reset"),  # it would have no effect
         ({"tau_SNR": None}, "reset"),  # a selective reset needs a threshold
         ({"alpha": 0.05}, "tau_SNR"),  # two gates on one ratio
-        ({"alpha": 1.0, "tau_SNR": None, "tau_reset": 0.1}, "alpha"),
         ({"alpha": 0.05, "tau_SNR": None, "tau_reset": 0.1, "beta2": 0.8}, "beta2"),
     ],
 )

@@ -9,7 +9,6 @@ import torch
 from scipy.integrate import quad
 
 from cadam3d.build import component
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import FIELDS, Gaussians
 from cadam3d.densifier.mcmc import MCMC, draw, share
 from cadam3d.densifier.refine import Refine
@@ -191,11 +190,3 @@ def test_the_noise_scales_with_the_rate_and_comes_from_the_generator():
     torch.testing.assert_close(2 * once, twice)
     assert not torch.equal(once, mcmc().perturb(scene, 0.01, draws(1)))
     assert not mcmc(noise_lr=0.0).perturb(scene, 0.01, draws()).any()
-
-
-@pytest.mark.parametrize(
-    ("key", "value"), [("cap", 0), ("growth", -0.1), ("growth", 1.5), ("noise_lr", -1.0)]
-)
-def test_an_impossible_value_is_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"densifier\.{key}"):
-        mcmc(**{key: value})

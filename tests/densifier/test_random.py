@@ -6,9 +6,7 @@ import pytest
 import torch
 
 from cadam3d.build import component
-from cadam3d.core.errors import UserError
 from cadam3d.core.reductions import quantile
-from cadam3d.core.schedule import Linear
 from cadam3d.densifier.random import RandomGrowth
 from cadam3d.settings.compose import compose
 
@@ -68,9 +66,3 @@ def test_the_annealed_quantile_follows_the_schedule_and_bounds_growth_as_the_pap
     assert tau_Q(calls[-1]) == pytest.approx(0.98)
     bound, paper = math.prod(2 - tau_Q(at) for at in calls), 1.1 ** len(calls)
     assert 0.9 * paper < bound < 1.35 * paper
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.0, Linear(start=0.5, end=1.0, steps=10)])
-def test_an_impossible_share_is_refused_by_name(share):
-    with pytest.raises(UserError, match=r"densifier\.share"):
-        RandomGrowth(share=share)

@@ -270,31 +270,6 @@ def test_gaussians_moments_and_densifier_state_stay_in_step_through_many_edits(d
     assert (len(optimizer.gaussians) > 30) == (not isinstance(densifier, NoGrowth))
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("steps", 0),
-        ("start", -1),
-        ("interval", 0),
-        ("tau_scale", 0.0),
-        ("split_children", 1),
-        ("split_shrink", 0.5),
-        ("min_opacity", 1.0),
-        ("max_scale", 0.0),
-        ("last_max_scale", 0.0),
-        ("last_min_alpha", 1.1),
-        ("reset_interval", 0),
-        ("reset_value", 1.0),
-        ("recovery", 0),
-        ("prune_grace", -1),
-        ("max_gaussians", 0),
-    ],
-)
-def test_an_impossible_value_is_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"refine\.{key}"):
-        refine(**{key: value})
-
-
 def test_a_reset_below_the_pruning_threshold_is_refused():
     with pytest.raises(UserError, match=r"refine\.min_opacity.*Try: refine\.min_opacity=0\.005$"):
         refine(reset_interval=300, min_opacity=0.05)

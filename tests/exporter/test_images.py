@@ -2,10 +2,8 @@
 
 import imageio.v3 as imageio
 import numpy as np
-import pytest
 import torch
 
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderOutput
 from cadam3d.exporter.images import ImagesExporter
@@ -46,14 +44,3 @@ def test_each_file_shows_the_view_in_its_name(tmp_path):
 def test_names_sort_in_the_order_of_the_views(tmp_path):
     paths = ImagesExporter(**VALUES).export(EMPTY, render_angles, tmp_path)
     assert sorted(paths) == paths
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        *(("views", 0), ("elevations_deg", [100.0]), ("background", "clear"), ("kinds", ["rgb", "x"])),
-    ],
-)
-def test_values_out_of_range_are_refused(key, value):
-    with pytest.raises(UserError, match=f"exporter.images.{key}"):
-        ImagesExporter(**VALUES | {key: value})

@@ -130,22 +130,6 @@ def test_a_texture_without_xatlas_names_the_extra(monkeypatch):
         MeshExporter(**{**SETTINGS, "texture": 64})
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("format", "fbx"),
-        ("up", "z"),
-        ("texture", 16),
-        ("textured_triangles", 3),
-        ("level", -1.0),
-        ("resolution", 2),
-    ],
-)
-def test_wrong_values_name_their_key(key, value):
-    with pytest.raises(UserError, match=rf"exporter\.mesh\.{key}"):
-        MeshExporter(**{**SETTINGS, key: value})
-
-
 def test_a_ply_has_no_texture():
     with pytest.raises(UserError, match=r"exporter\.mesh\.texture: .*Try: exporter\.mesh\.format=glb"):
         MeshExporter(**{**SETTINGS, "format": "ply", "texture": 512})

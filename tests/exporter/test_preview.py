@@ -2,10 +2,8 @@
 
 import imageio.v3 as imageio
 import numpy as np
-import pytest
 import torch
 
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderOutput
 from cadam3d.exporter.preview import PreviewExporter
@@ -55,16 +53,3 @@ def test_labels_are_written_on_request(tmp_path):
     labelled = imageio.imread(tmp_path / "preview.png")
     changed = (plain != labelled).any(axis=-1).reshape(3, 24, 4, 24).any(axis=(1, 3))
     assert changed.all()
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("views", 0),
-        ("elevations_deg", []),
-        ("elevations_deg", [0.0, 100.0]),
-    ],
-)
-def test_wrong_values_name_their_key(key, value):
-    with pytest.raises(UserError, match=rf"exporter\.preview\.{key}"):
-        PreviewExporter(**{**SETTINGS, key: value})

@@ -132,19 +132,3 @@ def test_a_frame_that_is_too_wide_for_the_codecs_is_refused_before_it_is_rendere
     subjects = [Subject(no_gaussians(), Recorder(), "a")] * 3
     with pytest.raises(UserError, match=r"^exporter\.turntable\.size: expected at most \d+,"):
         TurntableExporter(**{**SETTINGS, "size": 4096}).compare(subjects, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("views", 0),
-        ("elevation_deg", 91.0),
-        ("fps", 0),
-        ("beside", "normals"),
-        ("turns", 101),
-        ("codec", "avi"),
-    ],
-)
-def test_wrong_values_name_their_key(key, value):
-    with pytest.raises(UserError, match=rf"exporter\.turntable\.{key}"):
-        TurntableExporter(**{**SETTINGS, key: value})

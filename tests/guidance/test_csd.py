@@ -2,10 +2,8 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 
-from cadam3d.core.errors import UserError
 from cadam3d.core.schedule import Linear
 from cadam3d.prior.path import DDPM, per_view
 
@@ -89,8 +87,3 @@ def test_the_share_may_be_a_schedule_and_makes_no_unused_predictions(make, run, 
         prompted, *against = [call.condition for call in prior.calls]
         assert prompted is means
         assert [c if c is means else c.positive for c in against] == asked
-
-
-def test_a_share_that_leaves_its_range_is_refused(make):
-    with pytest.raises(UserError, match=r"guidance.empty_share: "):
-        make("csd", empty_share=Linear(start=1.0, end=-1.0, steps=10))

@@ -297,15 +297,6 @@ def test_wrong_values_are_refused_by_key(key, value, objective, make):
         make(objective, **{key: value})
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("clip", 0.0), ("clip", Linear(start=1.0, end=-1.0, steps=10))],
-)
-def test_wrong_weightings_and_clips_are_refused_by_key(key, value, distillation, make):
-    with pytest.raises(UserError, match=f"guidance.{key}: "):
-        make(distillation, **{key: value})
-
-
 def test_a_window_that_closes_during_training_is_refused_at_that_step(make, run, gaussian, means, rgb):
     guidance = make("sds", t_min=Steps(values=[0.02, 0.99, 0.02], milestones=[5, 6]))
     run(guidance, rgb, means, gaussian(DDPM()), step=4)

@@ -5,8 +5,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from cadam3d.core.errors import UserError
-from cadam3d.core.schedule import Linear, Steps
+from cadam3d.core.schedule import Linear
 from cadam3d.guidance.trajectory import ddim, strides
 from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
 
@@ -141,8 +140,3 @@ def test_an_infinite_gamma_at_the_end_of_a_flow_gives_zero_gradients(make, run, 
     gradient, output = run(guidance, rgb.float(), single, gaussian(RectifiedFlow()))
     assert (gradient == 0).all()
     assert output.log["guidance_nonfinite"] == gradient.numel()
-
-
-def test_an_interval_that_leaves_its_range_at_a_milestone_is_refused(make):
-    with pytest.raises(UserError, match=r"guidance\.delta: "):
-        make("ism", delta=Steps(values=[0.1, -0.1, 0.1], milestones=[5, 10]))

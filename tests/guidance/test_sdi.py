@@ -5,7 +5,6 @@ from itertools import pairwise
 import pytest
 import torch
 
-from cadam3d.core.errors import UserError
 from cadam3d.guidance.distill import Case
 from cadam3d.prior.path import DDPM, RectifiedFlow, per_view
 
@@ -130,12 +129,6 @@ def test_eta_adds_noise_in_proportion_to_b(path, make, gaussian, means, rgb):
     torch.rand(3, generator=generator)
     fresh = torch.randn(clean.shape, generator=generator).double()
     torch.testing.assert_close(moved - still, 0.3 * per_view(path.b(t)) * fresh, rtol=1e-9, atol=1e-12)
-
-
-def test_only_the_scale_of_the_inversion_may_be_negative(make):
-    assert make("sdi", inversion_scale=-7.5).inversion_scale == -7.5
-    with pytest.raises(UserError, match=r"guidance.scale: expected a number >= 0"):
-        make("sdi", scale=-7.5)
 
 
 def test_views_that_share_t_share_the_overshoot(make, run, gaussian, means, rgb):

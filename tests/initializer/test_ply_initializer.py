@@ -232,26 +232,6 @@ def test_a_mesh_is_refused_with_the_initializer_to_use(tmp_path):
         build(tmp_path / "box.ply")
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("up", "z"),
-        ("turn_deg", 45),
-        ("radius", 2.0),
-        ("count", 0),
-        ("sh_degree", 4),
-        ("replicate", 0),
-        ("replicate_radius", 0.0),
-        ("scale", -1.0),
-        ("opacity", 1.0),
-        ("color", [1.0]),
-    ],
-)
-def test_an_impossible_value_is_refused_by_name(key, value):
-    with pytest.raises(UserError, match=rf"initializer\.{key}: expected"):
-        ply("a.ply", **{key: value})
-
-
 def test_an_asset_too_large_to_be_measured_is_refused_only_if_it_is_scaled(tmp_path):
     far = 1e25
     huge = some_gaussians(3)

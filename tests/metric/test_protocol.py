@@ -79,8 +79,6 @@ def test_the_pictures_are_those_of_the_renderer():
     [
         ({"text": "no place"}, "protocol.text"),
         ({"text": "{} and {}"}, "protocol.text"),
-        ({"views": 0}, "protocol.views"),
-        ({"elevations_deg": []}, "protocol.elevations_deg"),
     ],
 )
 def test_wrong_values_are_named(change, message):

@@ -194,10 +194,12 @@ def test_an_import_of_the_plugins_loads_no_package_of_the_command_line():
         "collections",
         "dataclasses",
         "difflib",
+        "functools",
         "importlib",
         "math",
         "numpy",
         "sys",
+        "types",
         "typing",
     }
     assert imported_by(PACKAGE / "plugins/__init__.py") <= light

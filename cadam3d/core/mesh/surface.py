@@ -11,14 +11,14 @@ smoothing removes.
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cadam3d.core.checks import fail, require_range, require_whole
+from cadam3d.core.checks import BelowOne, Declared, fail, whole, within
 from cadam3d.core.console import followed
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
@@ -72,23 +72,16 @@ class Surface:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SurfaceSettings:
+class SurfaceSettings(Declared):
     """Settings of the surface of an asset, which exporters and metrics of meshes inherit."""
 
     # Node of the configuration, such as "exporter.mesh", with which error messages begin.
     node: ClassVar[str]
 
-    resolution: int  # cells along the longest side
-    level: float  # density at the surface
-    smallest_part: float  # share of the whole area, in [0, 1)
-    triangles: int | None  # None = no simplification
-
-    def __post_init__(self) -> None:
-        require_whole(f"{self.node}.resolution", self.resolution, low=16, high=1024)
-        require_range(f"{self.node}.level", self.level, above=0, high=1000)
-        require_range(f"{self.node}.smallest_part", self.smallest_part, low=0, below=1)
-        if self.triangles is not None:
-            require_whole(f"{self.node}.triangles", self.triangles, low=100, high=2**31)
+    resolution: Annotated[int, whole(low=16, high=1024)]  # cells along the longest side
+    level: Annotated[float, within(above=0, high=1000)]  # density at the surface
+    smallest_part: BelowOne  # share of the whole area
+    triangles: Annotated[int, whole(low=100, high=2**31)] | None  # None = no simplification
 
     def most_triangles(self) -> int | None:
         """Return the most triangles that the surface may have, or None for no limit."""

@@ -243,12 +243,3 @@ def test_extreme_numbers_give_a_mesh_or_a_message(key, value):
         assert facts(shape.vertices, shape.faces).is_watertight
         return
     assert "Try: " in message
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("resolution", 8), ("level", 0.0), ("smallest_part", 1.0), ("triangles", 10)],
-)
-def test_wrong_values_name_their_key(key, value):
-    with pytest.raises(UserError, match=rf"exporter\.mesh\.{key}"):
-        settings(**{key: value})
