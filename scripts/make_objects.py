@@ -19,6 +19,7 @@ import zipfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -69,8 +70,8 @@ WORLD: dict[str, Choice] = {
     "Blend Swap CC-0#motorbike": Choice("spring rider", "playground, outdoor, motorbike", turn_deg=-90),
     "Blend Swap CC-0#stoneLantern": Choice("pagoda lantern", "lantern, stone, garden"),
     "Blend Swap CC-0#lantern": Choice("stone lantern", "lantern, stone, garden"),
-    "Blend Swap CC-0#outdoorLamp": Choice("hanging lantern", "lantern, light"),
-    "Blend Swap CC-0#JapaneseLantern": Choice("paper lantern", "lantern, light", pixels=PRINT),
+    "Blend Swap CC-0#outdoorLamp": Choice("hanging lantern", "lantern, outdoor"),
+    "Blend Swap CC-0#JapaneseLantern": Choice("paper lantern", "lantern, decoration", pixels=PRINT),
     "Blend Swap CC-0#tetrapak": Choice("milk carton", "milk, carton, drink", pixels=PRINT),
     "Blend Swap CC-0#kalender": Choice("calendar", "office, paper", pixels=PRINT),
     "Blend Swap CC-0#emergencySign": Choice("exit sign", "sign", pixels=PRINT),
@@ -290,7 +291,7 @@ def primitives(parts: list[trimesh.Trimesh], model: Model) -> Iterator[trimesh.T
         yield joined(plain, uvs, Image.fromarray(palette[None]), model.rotation)
 
 
-def surface(part: trimesh.Trimesh):
+def surface(part: trimesh.Trimesh) -> Any:
     """Return the material, or for a part without one what gives it a default colour."""
     return getattr(part.visual, "material", part.visual)
 
@@ -300,9 +301,14 @@ def shrunk(image: Image.Image, pixels: int) -> Image.Image:
     image = image.convert("RGBA")
     has_holes = image.getchannel("A").getextrema()[0] < 128
     image.thumbnail((pixels, pixels), Image.Resampling.LANCZOS)
-    if not has_holes:
-        image = image.convert("RGB")
-        image.format = "JPEG"  # trimesh writes this format
+    if has_holes:
+        # Filters must not mix the colour of holes into their edges.
+        rgba = np.array(image)
+        is_solid = rgba[..., 3] >= 128
+        rgba[~is_solid, :3] = rgba[is_solid, :3].mean(axis=0)
+        return Image.fromarray(rgba)
+    image = image.convert("RGB")
+    image.format = "JPEG"  # trimesh writes this format
     return image
 
 

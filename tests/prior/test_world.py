@@ -92,27 +92,41 @@ def test_an_entry_keeps_its_words_and_the_licence_beside_the_model_wins(tmp_path
 def test_plain_colours_share_one_texture_with_exact_pixels(tmp_path):
     obj = SQUARE + "usemtl red\nf 1//1 2//1 3//1\nusemtl blue\nf 1//1 3//1 4//1\n"
     [part] = parts_of(make_objects.to_glb(a_library(tmp_path, obj)))
-    colors = trimesh.visual.uv_to_color(
-        part.visual.uv[part.faces[:, 0]], part.visual.material.baseColorTexture
-    )
-    assert {tuple(color[:3]) for color in colors.tolist()} == {(255, 0, 0), (0, 0, 255)}
+    pixels = np.array(part.visual.material.baseColorTexture)[0]
+    assert np.allclose(np.unique(part.visual.uv[:, 0]), (0.25, 0.75))
+    colors = pixels[(part.visual.uv[:, 0] * len(pixels)).astype(int)]
+    lower = part.triangles_center[:, 0] > part.triangles_center[:, 1]
+    assert (colors[part.faces[lower]] == (255, 0, 0)).all()
+    assert (colors[part.faces[~lower]] == (0, 0, 255)).all()
+    assert lower.sum() == 1
+
+
+def test_faces_of_no_area_are_left_out_and_normals_of_no_length_become_those_of_the_faces(tmp_path):
+    obj = SQUARE + "vn 0 0 0\nusemtl red\nf 1//2 2//2 3//2\nf 1//1 2//1 1//1\n"
+    [part] = parts_of(make_objects.to_glb(a_library(tmp_path, obj)))
+    assert len(part.faces) == 1
+    assert np.allclose(part.vertex_normals, (0, 0, 1))
 
 
 @pytest.mark.parametrize(("alpha", "mode"), [(255, "OPAQUE"), (0, "MASK")])
-def test_a_texture_with_holes_is_a_mask_and_any_texture_is_shrunk(tmp_path, alpha, mode):
+def test_a_texture_is_shrunk_and_one_with_holes_is_a_mask_of_one_colour(tmp_path, alpha, mode):
     obj = SQUARE + "vt 0 0\nusemtl map\nf 1/1/1 2/1/1 3/1/1\n"
-    image = Image.new("RGBA", (1024, 8), (0, 255, 0, alpha))
+    image = Image.new("RGBA", (1024, 8), (0, 254, 0, 255))
+    image.paste((0, 254, 0, 255) if alpha else (255, 0, 0, alpha), (0, 0, 512, 8))
     [part] = parts_of(make_objects.to_glb(a_library(tmp_path, obj, image)))
-    material = part.visual.material
-    assert (material.alphaMode, material.baseColorTexture.size) == (mode, (512, 4))
+    texture = part.visual.material.baseColorTexture
+    assert (part.visual.material.alphaMode, texture.size) == (mode, (512, 4))
+    assert np.allclose(np.array(texture)[..., :3], (0, 254, 0), atol=2)
 
 
 def test_the_rotation_of_the_library_and_then_the_turn_of_the_choice_are_applied(tmp_path):
     """The library puts x to the top; a turn of 90 degrees then brings the side at -x to the front."""
-    model = a_library(tmp_path, SQUARE, modelRotation="0 -1 0 1 0 0 0 0 1")
+    obj = SQUARE + "usemtl red\nf 1//1 2//1 3//1\n"
+    model = a_library(tmp_path, obj, modelRotation="0 -1 0 1 0 0 0 0 1")
     [chosen] = make_objects.chosen([model], {"A#b": make_objects.Choice("thing", "toy", turn_deg=90)})
-    assert np.allclose(chosen.rotation @ [1, 0, 0], [0, 1, 0])
-    assert np.allclose(chosen.rotation @ [0, 1, 0], [0, 0, 1])
+    [part] = parts_of(make_objects.to_glb(chosen))
+    assert np.allclose(sorted(part.vertices.tolist()), [(0, 0, 0), (0, 1, 0), (0, 1, 1)], atol=1e-6)
+    assert np.allclose(part.vertex_normals, (1, 0, 0), atol=1e-6)
 
 
 def test_a_concave_polygon_keeps_its_area(tmp_path):
