@@ -55,7 +55,7 @@ def test_the_wheel_carries_the_package_with_its_settings_and_nothing_else_of_the
     here = {f"cadam3d/{path.relative_to(REPOSITORY)}" for path in find("configs", "*.yaml")}
     assert {name for name in names if name.startswith("cadam3d/configs/")} == here
     patterns = ("*.py", "*.pyi", "*.typed", "*.yaml", "*.js", "*.css", "*.html", "*.jinja")
-    patterns += ("*.cpp", "*.h", "*.cu", "*.cuh")
+    patterns += ("*.cpp", "*.h", "*.cu", "*.cuh", "*.glb", "catalog.json")
     sources = {str(path.relative_to(REPOSITORY)) for each in patterns for path in find("cadam3d", each)}
     assert {"cadam3d/py.typed", "cadam3d/__init__.pyi", "cadam3d/trainer.py"} <= sources <= names
     assert {name for name in names if name.endswith(".py")} <= sources
