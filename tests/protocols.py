@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from cadam3d.core.rendering import RenderOutput
-from cadam3d.metric.protocol import RingProtocol
+from cadam3d.metric.protocol import Protocol
 
 
-def ring(**changes: Any) -> RingProtocol:
+def ring(**changes: Any) -> Protocol:
     """Return a ring of three views on white, of which the mean counts, with some other settings."""
     settings: dict[str, Any] = {
         "name": "small",
@@ -22,7 +22,7 @@ def ring(**changes: Any) -> RingProtocol:
         "text": "{}",
         "models": {},
     }
-    return RingProtocol(**settings | changes)
+    return Protocol(**settings | changes)
 
 
 def output(rgb: Tensor, alpha: Tensor | None = None) -> RenderOutput:
