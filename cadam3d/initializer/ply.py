@@ -17,7 +17,6 @@ from cadam3d.initializer.points import (
     PointCloud,
     Radius,
     ReplicateLaw,
-    found_file,
     one_color,
     replicated,
     rows_of,
@@ -26,6 +25,7 @@ from cadam3d.io.asset_file import PLY, file_format, read_gaussians, say_assumed
 from cadam3d.io.frames import UPS, points_to_world, turned, turned_points
 from cadam3d.io.ply import holds_gaussians, read_points
 from cadam3d.io.ply_tables import read_header
+from cadam3d.io.run_folder import found_file
 
 # Point-E and most scans use this axis.
 UP_OF_POINTS = "+z"
@@ -55,7 +55,7 @@ class Ply(FromObject):
 
         Raises ``UserError`` if the file is missing, cannot be read or holds neither.
         """
-        path = found_file(self.path)
+        path = found_file(self.path, "initializer.path")
         if file_format(path) == PLY and not holds_gaussians(path):
             return self._cloud(path, generator, device)
         return self._asset(path, generator).to(device)

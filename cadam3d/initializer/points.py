@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 import torch
@@ -16,7 +15,6 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE, rgb_to_sh0
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.frames import TURNS
-from cadam3d.io.run_folder import expanded, has_file
 
 # As in 3DGS (Kerbl et al. 2023, sec. 5.1).
 NEIGHBOURS = 3
@@ -220,11 +218,3 @@ def fit(points: Float[Tensor, "n 3"], radius: float | None) -> tuple[Float[Tenso
     expected, got = "points at distances below 1e19", float(points.abs().max())
     require(math.isfinite(farthest), "initializer.path", expected=expected, got=got)
     return center, radius / farthest if farthest > 0 else 1.0
-
-
-def found_file(path: str) -> Path:
-    """Return the path that ``initializer.path`` names. Raises ``UserError`` unless it is a file."""
-    found = expanded(path)
-    example = "initializer.path=FILE"
-    require(has_file(found), "initializer.path", expected="a file", got=path, example=example)
-    return found

@@ -10,6 +10,7 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
+from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
 
 # Written by training.
@@ -253,6 +254,13 @@ def typed_path(text: str) -> Path:
         return path.resolve()
     except (OSError, RuntimeError):
         return path.absolute()
+
+
+def found_file(path: str, key: str) -> Path:
+    """Return the path that the setting ``key`` names. Raises ``UserError`` unless it is a file."""
+    found = expanded(path)
+    require(has_file(found), key, expected="a file", got=path, example=f"{key}=FILE")
+    return found
 
 
 def has_file(folder: Path, name: str = "") -> bool:

@@ -9,12 +9,12 @@ from cadam3d.initializer.ball import Ball
 from cadam3d.initializer.points import (
     PointCloud,
     fit,
-    found_file,
     neighbour_distance,
     points_on_surface,
     replicated,
     rows_of,
 )
+from cadam3d.io.run_folder import found_file
 
 
 def cloud(n: int, seed: int = 0) -> torch.Tensor:
@@ -163,4 +163,4 @@ def test_a_surface_is_covered_in_proportion_to_its_area():
 @pytest.mark.parametrize("name", [".", "absent.ply", "x" * 5000, "null\0byte"])
 def test_a_path_that_is_no_file_is_refused(name):
     with pytest.raises(UserError, match=r"^initializer\.path: expected a file"):
-        found_file(name)
+        found_file(name, "initializer.path")
