@@ -11,7 +11,6 @@ import torch
 import trimesh
 from jaxtyping import Float
 from PIL import Image
-from torch import Tensor
 from trimesh.resolvers import FilePathResolver, Resolver
 
 from cadam3d.core.console import say
@@ -47,15 +46,16 @@ def read_mesh(
     # Every format has its own parser, with its own exceptions.
     try:
         parts = _parts(file, nearby)
-        is_lost = [_is_lost(part.visual) for part in parts]
+        found = {id(image) for part in parts if (image := _image_of(part.visual)) is not None}
         mesh = _joined(parts, up, plain)
     except Exception as error:
         raise UserError(
             f"{key}: expected a file with a mesh ({', '.join(SUFFIXES)}, or one of them in a .zip), "
             f"got {path!r}, which cannot be read ({str(error) or type(error).__name__})."
         ) from error
-    if any(is_lost) and not all(name.lower().endswith(".mtl") for name in nearby.asked):
-        reason = "has no texture that can be read, so it has the colours of its materials"
+    asked = {name for name in nearby.asked if not name.lower().endswith((".mtl", ".bin"))}
+    if len(found) < len(asked):
+        reason = "has a texture that cannot be read, so it has the colour of its material there"
         say(f"Note: {file.name} {reason}", logging.WARNING)
     if not bool(mesh.vertices.isfinite().all()) or sum(float(part.area) for part in parts) <= 0:
         raise UserError(f"{key}: expected a mesh with triangles, got {path!r}, which has no surface.")
@@ -190,7 +190,7 @@ def _picture(part: trimesh.Trimesh) -> np.ndarray:
     visual: Any = part.visual
     if visual.kind != "texture":
         return np.full((1, 1, 4), 255, np.uint8)
-    material, image = visual.material, _image_of(visual.material)
+    material, image = visual.material, _image_of(visual)
     mode = getattr(material, "alphaMode", None) or ("MASK" if hasattr(material, "image") else "OPAQUE")
     factor = getattr(material, "baseColorFactor", None)
     factor = np.ones(4) if factor is None else np.asarray(factor) / 255
@@ -208,31 +208,16 @@ def _picture(part: trimesh.Trimesh) -> np.ndarray:
     return rgba
 
 
-def _image_of(material: Any) -> Image.Image | None:
+def _image_of(visual: Any) -> Image.Image | None:
+    """Return the picture of a part, or None if it has none that can be decoded."""
+    material = getattr(visual, "material", None)
     image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
-    if image is not None and image.width * image.height > LARGEST_PICTURE:
+    if image is None:
+        return None
+    if image.width * image.height > LARGEST_PICTURE:
         raise ValueError(f"a picture has {image.width} x {image.height} pixels")
-    return image
-
-
-def _is_lost(visual: Any) -> bool:
-    """Return whether a part should have a picture, but it cannot be decoded; then it is taken away."""
-    if visual.kind != "texture":
-        return False
     try:
-        image = _image_of(visual.material)
-        if image is not None and image.load() is not None:
-            return False
+        image.load()
     except (OSError, SyntaxError):  # what Pillow raises for a damaged picture
-        pass
-    for name in ("image", "baseColorTexture"):
-        if getattr(visual.material, name, None) is not None:
-            setattr(visual.material, name, None)
-    return True
-
-
-def fitted(mesh: TexturedMesh, radius: float) -> Float[Tensor, "n 3"]:
-    """Return the vertices with the centre of their box at the origin and the farthest one at ``radius``."""
-    used = mesh.vertices[mesh.faces.unique()]
-    middle = (used.amin(0) + used.amax(0)) / 2
-    return (mesh.vertices - middle) * (radius / (used - middle).norm(dim=1).max())
+        return None
+    return image

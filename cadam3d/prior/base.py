@@ -23,6 +23,13 @@ class Condition(ABC):
     def unprompted(self) -> "Condition":
         """Return the same views under the empty prompt and the empty negative prompt (for inversion)."""
 
+    def nearest(self, rgb: Float[Tensor, "v h w 3"]) -> Float[Tensor, "v h w 3"] | None:
+        """Return the true images of these views, or None if they are not known; all are in [0, 1].
+
+        If the prompt leaves something open, they show the mode that is nearest to the images ``rgb``.
+        """
+        return None
+
 
 class PromptEmbedding(ABC):
     """A prompt and a negative prompt, embedded once per run."""

@@ -109,6 +109,11 @@ class ExactCondition(Condition):
         """Return the same views under the empty prompt, which allows every object of the world."""
         return replace(self, positive=self.empty, negative=self.empty)
 
+    def nearest(self, rgb: Float[Tensor, "v h w 3"]) -> Float[Tensor, "v h w 3"]:
+        """Return the images of the mode that is nearest to ``rgb`` over all views, in [0, 1]."""
+        modes = (self.positive.means.permute(1, 0, 3, 4, 2) + 1) / 2
+        return modes[(modes - rgb).square().mean(dim=(1, 2, 3, 4)).argmin()]
+
 
 @dataclass(frozen=True)
 class ExactEmbedding(PromptEmbedding):

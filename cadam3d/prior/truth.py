@@ -7,7 +7,10 @@ from typing import ClassVar
 from cadam3d.core.checks import fail, require_choice, require_whole, unless_none
 from cadam3d.core.errors import UserError
 from cadam3d.core.rendering import Truth
+from cadam3d.io.frames import UPS
 from cadam3d.prior.base import DiffusionPrior
+from cadam3d.prior.objects.catalog import read_catalog
+from cadam3d.prior.objects.scene import MeshScene, read_object
 from cadam3d.prior.shapes.prior import shapes_scene
 from cadam3d.prior.shapes.tracing import TRACERS, find_tracer
 
@@ -45,6 +48,28 @@ class NoTruth(TruthSource):
     def of(self, prompt: str, prior: DiffusionPrior) -> Truth | None:
         """Return None."""
         return None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshTruth(TruthSource):
+    """A textured mesh from a file, upright and as large as every object of ``prior=objects``."""
+
+    measures_start: ClassVar[bool] = True
+
+    path: str | None
+    up: str  # one of UPS; the up axis of the file
+    samples_per_pixel: int  # along each axis
+    turns: int | None  # None: the front of the asset is known
+
+    def __post_init__(self) -> None:
+        require_choice("truth.up", self.up, UPS)
+        require_whole("truth.samples_per_pixel", self.samples_per_pixel, low=1, high=8)
+        unless_none(require_whole, "truth.turns", self.turns, low=2, high=MOST_TURNS)
+
+    def of(self, prompt: str, prior: DiffusionPrior) -> Truth:
+        """Return the mesh, whatever the prompt is. Raises ``UserError`` if it cannot be read."""
+        mesh = read_object(self.path or "", "truth.path", self.up)
+        return MeshScene([mesh], read_catalog(None).census).truth(self.samples_per_pixel, self.turns)
 
 
 @dataclass(frozen=True, kw_only=True)

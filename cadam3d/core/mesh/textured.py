@@ -72,7 +72,8 @@ def _halved(picture: UInt8[Tensor, "h w 4"]) -> list[UInt8[Tensor, "_ _ 4"]]:
     return found
 
 
-@dataclass(frozen=True)
+# Compared by identity, so that what is computed from a mesh can be kept for it.
+@dataclass(frozen=True, eq=False)
 class TexturedMesh:
     """Triangles in world units, +z up and the front at +x, each with a picture."""
 

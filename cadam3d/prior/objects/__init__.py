@@ -1,0 +1,1 @@
+"""prior=objects: an exact diffusion model of a folder of textured meshes."""
