@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.chart import Chart, Curve
-from cadam3d.core.checks import fail, require_range
+from cadam3d.core.checks import Positive, Share, fail
 from cadam3d.guidance.base import Guidance, GuidanceOutput
 from cadam3d.prior.base import Condition, DiffusionPrior
 
@@ -27,12 +27,8 @@ class Photometric(Guidance):
     If the prompt has several modes, the one nearest to the renders is the truth. The log holds ``l1``.
     """
 
-    weight: float  # > 0
-    ssim_share: float  # in [0, 1]
-
-    def __post_init__(self) -> None:
-        require_range("guidance.weight", self.weight, above=0)
-        require_range("guidance.ssim_share", self.ssim_share, low=0, high=1)
+    weight: Positive
+    ssim_share: Share
 
     def __call__(
         self,

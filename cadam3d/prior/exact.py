@@ -8,13 +8,14 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras, fitting_distance, turntable
-from cadam3d.core.checks import require_range, require_whole
+from cadam3d.core.checks import whole, within
 from cadam3d.core.errors import UserError
 from cadam3d.core.rendering import Triangles, Truth
 from cadam3d.io.atomic import replacing
@@ -32,6 +33,9 @@ ERROR_GRID = 8
 # independent noises are uncorrelated.
 ERROR_FREQUENCY = 3.0
 PACKAGE = Path(__file__).parents[1]
+
+Spread = Annotated[float, within(low=0, high=10)]
+Samples = Annotated[int, whole(low=1, high=8)]  # points per pixel along each axis
 
 
 class ExactScene(ABC):
@@ -139,20 +143,12 @@ class ExactPrior(DiffusionPrior):
     """
 
     noise_path: NoisePath
-    spread: float  # in model space
-    edge_spread: float  # in model space
-    model_error: float  # in model space
-    samples_per_pixel: int  # along each axis
-    census_size: int  # pixels per side
-    seed: int
-
-    def __post_init__(self) -> None:
-        require_range("prior.spread", self.spread, low=0, high=10)
-        require_range("prior.edge_spread", self.edge_spread, low=0, high=10)
-        require_range("prior.model_error", self.model_error, low=0, high=10)
-        require_whole("prior.samples_per_pixel", self.samples_per_pixel, low=1, high=8)
-        require_whole("prior.census_size", self.census_size, low=2, high=256)
-        require_whole("prior.seed", self.seed, low=0, high=2**62)
+    spread: Spread  # in model space
+    edge_spread: Spread  # in model space
+    model_error: Spread  # in model space
+    samples_per_pixel: Samples
+    census_size: Annotated[int, whole(low=2, high=256)]  # pixels per side
+    seed: Annotated[int, whole(low=0, high=2**62)]
 
     @abstractmethod
     def scene(self, prompt: str, key: str = "prompt") -> ExactScene:

@@ -2,22 +2,23 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from cadam3d.core.checks import fail, require_choice, require_whole, unless_none
+from cadam3d.core.checks import Declared, fail, one_of, whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.rendering import Truth
 from cadam3d.io.frames import UPS
 from cadam3d.prior.base import DiffusionPrior
+from cadam3d.prior.exact import Samples
 from cadam3d.prior.objects.catalog import read_catalog
 from cadam3d.prior.objects.scene import MeshScene, read_object
 from cadam3d.prior.shapes.prior import shapes_scene
-from cadam3d.prior.shapes.tracing import TRACERS, find_tracer
+from cadam3d.prior.shapes.tracing import TracerName, find_tracer
 
-MOST_TURNS = 72
+Turns = Annotated[int, whole(low=2, high=72)]
 
 
-class TruthSource(ABC):
+class TruthSource(Declared, ABC):
     """Names the true object of a prompt. A subclass is a frozen dataclass of its settings."""
 
     # Whether the Gaussians at the start of a run are measured too, as a baseline for those at its end.
@@ -57,14 +58,9 @@ class MeshTruth(TruthSource):
     measures_start: ClassVar[bool] = True
 
     path: str | None
-    up: str  # one of UPS; the up axis of the file
-    samples_per_pixel: int  # along each axis
-    turns: int | None  # None: the front of the asset is known
-
-    def __post_init__(self) -> None:
-        require_choice("truth.up", self.up, UPS)
-        require_whole("truth.samples_per_pixel", self.samples_per_pixel, low=1, high=8)
-        unless_none(require_whole, "truth.turns", self.turns, low=2, high=MOST_TURNS)
+    up: Annotated[str, one_of(UPS)]  # the up axis of the file
+    samples_per_pixel: Samples
+    turns: Turns | None  # None: the front of the asset is known
 
     def of(self, prompt: str, prior: DiffusionPrior) -> Truth:
         """Return the mesh, whatever the prompt is. Raises ``UserError`` if it cannot be read."""
@@ -81,14 +77,9 @@ class ShapesTruth(TruthSource):
 
     measures_start: ClassVar[bool] = True
 
-    samples_per_pixel: int  # along each axis
-    turns: int | None  # None: the front of the asset is known
-    tracer: str  # of TRACERS
-
-    def __post_init__(self) -> None:
-        require_whole("truth.samples_per_pixel", self.samples_per_pixel, low=1, high=8)
-        unless_none(require_whole, "truth.turns", self.turns, low=2, high=MOST_TURNS)
-        require_choice("truth.tracer", self.tracer, TRACERS)
+    samples_per_pixel: Samples
+    turns: Turns | None  # None: the front of the asset is known
+    tracer: TracerName
 
     def of(self, prompt: str, prior: DiffusionPrior) -> Truth:
         """Return the scene of ``prompt``.

@@ -6,6 +6,7 @@ from cadam3d.prior.exact import ExactEmbedding, ExactPrior, ExactScene
 from cadam3d.prior.objects.catalog import read_catalog
 from cadam3d.prior.objects.prior import ObjectsPrior
 from cadam3d.prior.shapes.prior import ShapesPrior
+from cadam3d.prior.shapes.tracing import TracerName
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -13,7 +14,7 @@ class WorldPrior(ExactPrior):
     """An exact diffusion model of both worlds."""
 
     folder: str | None  # of objects; None: those that come with cadam3d
-    tracer: str  # of shapes; one of TRACERS
+    tracer: TracerName  # of shapes
 
     def embed(self, prompt: str, negative: str) -> ExactEmbedding:
         """Read both prompts in the world of the first one, and say which objects it names."""

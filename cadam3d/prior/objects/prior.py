@@ -1,8 +1,9 @@
 """ObjectsPrior: an exact diffusion model of a folder of textured meshes. MeshPrior: of a single one."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from cadam3d.core.checks import fail, require_choice
+from cadam3d.core.checks import fail, one_of
 from cadam3d.core.console import say
 from cadam3d.io.frames import UPS
 from cadam3d.prior.exact import ExactEmbedding, ExactPrior
@@ -45,11 +46,7 @@ class MeshPrior(ExactPrior):
     """A Gaussian over images of one mesh, whatever the prompt says."""
 
     path: str
-    up: str  # one of UPS; the up axis of the file
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_choice("prior.up", self.up, UPS)
+    up: Annotated[str, one_of(UPS)]  # the up axis of the file
 
     def scene(self, prompt: str, key: str = "prompt") -> MeshScene:
         """Return the mesh. Raises ``UserError`` if it cannot be read, or if it has no triangles."""

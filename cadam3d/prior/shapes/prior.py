@@ -8,14 +8,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import fail, require_choice
+from cadam3d.core.checks import fail
 from cadam3d.core.mesh.distance import true_surfaces
 from cadam3d.core.rendering import Triangles
 from cadam3d.prior.exact import Census, ExactPrior, ExactScene, stored_census
 from cadam3d.prior.shapes.grammar import EXAMPLE
 from cadam3d.prior.shapes.objects import known_objects, known_primitives
 from cadam3d.prior.shapes.scene import Scene, build, signed_distance
-from cadam3d.prior.shapes.tracing import TRACERS, find_tracer, tracer_for
+from cadam3d.prior.shapes.tracing import TracerName, find_tracer, tracer_for
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,7 @@ class ShapesScene(ExactScene):
 class ShapesPrior(ExactPrior):
     """A Gaussian mixture over images of procedural shapes, one mode per choice of open colours."""
 
-    tracer: str  # of TRACERS
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_choice("prior.tracer", self.tracer, TRACERS)
+    tracer: TracerName
 
     def scene(self, prompt: str, key: str = "prompt") -> ShapesScene:
         """Parse the prompt in the setting ``key``.

@@ -7,16 +7,19 @@ without a compiler. The native one is many times faster, but it needs a compiler
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
+from typing import Annotated
 
 import torch
 
 from cadam3d.core.cameras import Cameras
+from cadam3d.core.checks import one_of
 from cadam3d.core.errors import UserError
 from cadam3d.prior.shapes.native_tracer import load_tracer, trace_natively
 from cadam3d.prior.shapes.scene import Scene
 from cadam3d.prior.shapes.tracer import Layers, trace
 
 TRACERS = ("auto", "native", "torch")
+TracerName = Annotated[str, one_of(TRACERS)]
 
 
 @dataclass(frozen=True)
