@@ -215,7 +215,7 @@ def write_folder(folder: Path, models: list[Model]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(to_glb(model))
         keys = ("id", "file", "name", "tags", "licence", "author")
-        rows.append(json.dumps({key: getattr(model, key) for key in keys} | {"up": "y"}, ensure_ascii=False))
+        rows.append(json.dumps({key: getattr(model, key) for key in keys} | {"up": "+y"}, ensure_ascii=False))
     text = "[\n" + ",\n".join(rows) + "\n]\n"
     (folder / "catalog.json").write_text(text, encoding="utf-8")
     size = sum((folder / model.file).stat().st_size for model in models)

@@ -31,7 +31,7 @@ def test_the_catalogue_names_each_file_once_and_fills_each_field():
     assert sorted(row["file"] for row in ROWS) == sorted(path.name for path in FOLDER.glob("*.glb"))
     keys = ["id", "file", "name", "tags", "licence", "author", "up"]
     assert all(list(row) == keys and all(row.values()) for row in ROWS)
-    assert {(row["licence"], row["up"]) for row in ROWS} == {("CC0-1.0", "y")}
+    assert {(row["licence"], row["up"]) for row in ROWS} == {("CC0-1.0", "+y")}
     for key in ("id", "name"):
         assert len({row[key] for row in ROWS}) == len(ROWS)
 
