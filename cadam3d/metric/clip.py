@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from cadam3d.metric.scoring import ModelMetric, Scorer, too_long
-from cadam3d.metric.transformer import TransformerFolder, TransformerSource, kept
+from cadam3d.metric.transformer import TransformerFolder, kept
 
 # The settings of an image processor that change the pixels.
 PREPROCESSING = ("size", "resample", "crop_size", "do_center_crop", "image_mean", "image_std")
@@ -82,9 +82,8 @@ class ClipMetric(ModelMetric):
         check_clip(found)
 
 
-def load_clip(source: TransformerSource, device: torch.device) -> Clip:
-    """Return the CLIP model of ``source``, on ``device``. Raises ``UserError`` if it is not available."""
-    found = source.find()
+def load_clip(found: TransformerFolder, device: torch.device) -> Clip:
+    """Return the CLIP model in a folder, on ``device``. Raises ``UserError`` if it cannot be used."""
     return kept(_loaded, found, found.facts()["weights_sha256"], device)
 
 

@@ -47,7 +47,7 @@ class ClipRPrecision(ClipMetric):
         Raises ``UserError`` if the prompts cannot be read.
         """
         candidates = read_candidates(self.prompts)
-        clip = load_clip(self.source(), device)
+        clip = load_clip(self.find(), device)
         texts = [self.protocol.text_of(prompt) for prompt in candidates]
         known = torch.cat([clip.texts(texts[at : at + BATCH]) for at in range(0, len(texts), BATCH)])
         own = cache(lambda text: clip.texts([text])[0])

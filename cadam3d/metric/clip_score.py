@@ -28,4 +28,4 @@ class ClipScore(ClipMetric):
 
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture a score in [-100, 100]."""
-        return load_clip(self.source(), device).scorer(PERCENT)
+        return load_clip(self.find(), device).scorer(PERCENT)

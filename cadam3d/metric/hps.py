@@ -14,7 +14,7 @@ from cadam3d.io.pretrained import read_tensors, short
 from cadam3d.metric.clip import Clip, ClipMetric, assembled, check_clip
 from cadam3d.metric.open_clip import clip_model
 from cadam3d.metric.scoring import Scorer
-from cadam3d.metric.transformer import TransformerFolder, TransformerSource, downloaded, kept, model_facts
+from cadam3d.metric.transformer import TransformerFolder, downloaded, find_model, kept, model_facts
 
 # The files of a CLIP model except its weights, all of which are small.
 SMALL = ("*.json", "*.txt")
@@ -50,19 +50,19 @@ class Hps(ClipMetric):
         return kept(_loaded, file, self._base(), tuple(facts.items()), device).scorer()
 
     def _base(self) -> TransformerFolder:
-        return TransformerSource(f"{self.node}.base", self.base, needed=SMALL).find()
+        return find_model(f"{self.node}.base", self.base, SMALL)
 
     def _file(self) -> tuple[Path, str, str | None]:
         """Return the file with the weights, its name in records, and its commit if it is from the hub."""
-        source = self.source()
-        file = Path(source.model).expanduser()
+        key, (model, _, revision) = f"{self.node}.model", self.named_model().partition("@")
+        file = Path(model).expanduser()
         if file.is_file():
-            return file, source.model, None
-        repository, _, name = source.model.rpartition("/")
+            return file, model, None
+        repository, _, name = model.rpartition("/")
         if repository.count("/") != 1:
-            raise fail(source.key, expected="a file, or OWNER/NAME/FILE on the hub", got=source.model)
-        folder = downloaded(source.key, repository, source.revision, (name,))
-        return folder / name, source.model, folder.name
+            raise fail(key, expected="a file, or OWNER/NAME/FILE on the hub", got=model)
+        folder = downloaded(key, repository, revision or None, (name,))
+        return folder / name, model, folder.name
 
 
 def _loaded(
@@ -75,6 +75,6 @@ def _loaded(
         if is_out_of_memory(error):
             raise
         raise UserError(
-            f"{Hps.node}.model: {file} does not fit {Hps.node}.base={base.source.model} ({short(error)})"
+            f"{Hps.node}.model: {file} does not fit {Hps.node}.base={base.model} ({short(error)})"
         ) from error
     return assembled(base, model, dict(facts), device)

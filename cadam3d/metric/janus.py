@@ -83,7 +83,7 @@ class Janus(ClipMetric):
 
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, whose scores are the logits of the texts for a picture."""
-        clip = load_clip(self.source(), device)
+        clip = load_clip(self.find(), device)
         direction = cache(lambda text: clip.texts([text])[0])
         # The same pictures are compared with several texts in a row.
         pictures = lru_cache(maxsize=1)(clip.pictures)

@@ -26,5 +26,5 @@ class PickScore(ClipMetric):
 
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture a score."""
-        clip = load_clip(self.source(), device)
+        clip = load_clip(self.find(), device)
         return clip.scorer(clip.logit_scale)

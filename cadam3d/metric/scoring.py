@@ -20,7 +20,7 @@ from cadam3d.core.number import Number
 from cadam3d.io.pretrained import short
 from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.protocol import Protocol
-from cadam3d.metric.transformer import TransformerFolder, TransformerSource
+from cadam3d.metric.transformer import NEEDED, TransformerFolder, find_model
 
 LEVEL = 0.95  # of the interval
 
@@ -124,6 +124,7 @@ class ModelMetric(ScoreMetric):
 
     node: ClassVar[str]  # of the configuration, such as "metric.clip_score"
     kind: ClassVar[str]  # the name of the model in protocols, such as "clip"
+    needed: ClassVar[tuple[str, ...]] = NEEDED  # patterns of the files that are downloaded
 
     model: str | None  # a folder, or OWNER/NAME or OWNER/NAME@COMMIT on the hub; None = the protocol's
 
@@ -132,7 +133,7 @@ class ModelMetric(ScoreMetric):
 
         The weights are not loaded, because they would take memory during training.
         """
-        found = self.source().find()
+        found = self.find()
         found.weights()
         self.check_model(found)
 
@@ -140,15 +141,18 @@ class ModelMetric(ScoreMetric):
     def check_model(self, found: TransformerFolder) -> None:
         """Raise ``UserError`` if the small files of a model show that it is of another kind or incomplete."""
 
-    def source(self) -> TransformerSource:
-        """Return the place of the model. Raises ``UserError`` if neither metric nor protocol names one."""
+    def find(self) -> TransformerFolder:
+        """Find the folder of the model, after a download if necessary. Raises ``UserError`` if it fails."""
+        return find_model(f"{self.node}.model", self.named_model(), self.needed)
+
+    def named_model(self) -> str:
+        """Return the name of the model. Raises ``UserError`` if neither metric nor protocol names one."""
         named = self.protocol.models.get(self.kind) if self.model is None else self.model
         if named is None:
             raise UserError(
                 f"{self.node}.model: protocol={self.protocol.name} names no model for this metric"
             )
-        model, _, revision = named.partition("@")
-        return TransformerSource(f"{self.node}.model", model, revision or None)
+        return named
 
 
 def too_long(tokens: int, longest: int) -> tuple[str, ...]:

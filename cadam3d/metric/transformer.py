@@ -29,31 +29,22 @@ KEPT = 3  # models in memory
 Model = TypeVar("Model")
 
 
-@dataclass(frozen=True)
-class TransformerSource:
-    """The place to search for a model."""
+def find_model(key: str, named: str, needed: tuple[str, ...] = NEEDED) -> "TransformerFolder":
+    """Find the folder of a model, after a download if it is on the hub and not on this disk.
 
-    # The setting that names the model, such as "metric.clip_score.model", with which messages begin. It is
-    # not compared, because the models of several metrics may be the same.
-    key: str = field(compare=False)
-    model: str  # a folder, or OWNER/NAME on the Hugging Face hub
-    revision: str | None = None  # on the hub; None = the newest
-    needed: tuple[str, ...] = NEEDED  # patterns of the files that are downloaded
-
-    def find(self) -> "TransformerFolder":
-        """Find the folder of the model, after a download if it is on the hub and not on this disk.
-
-        Raises ``UserError`` if it cannot be found.
-        """
-        require_extra(self.key)
-        folder = Path(self.model).expanduser()
-        if (folder / CONFIG).is_file():
-            return TransformerFolder(self, folder, None)
-        if folder.exists() or self.model.count("/") != 1 or self.model[0] in "./~":
-            expected = f"a folder with the {CONFIG} of a model, or OWNER/NAME on the hub"
-            raise fail(self.key, expected=expected, got=self.model)
-        folder = downloaded(self.key, self.model, self.revision, self.needed)
-        return TransformerFolder(self, folder, folder.name)
+    ``key`` is the setting that names the model: a folder, or OWNER/NAME or OWNER/NAME@COMMIT on the hub.
+    ``needed`` are patterns of the files that are downloaded. Raises ``UserError`` if it cannot be found.
+    """
+    require_extra(key)
+    model, _, revision = named.partition("@")
+    folder = Path(model).expanduser()
+    if (folder / CONFIG).is_file():
+        return TransformerFolder(key, model, folder, None)
+    if folder.exists() or model.count("/") != 1 or model[0] in "./~":
+        expected = f"a folder with the {CONFIG} of a model, or OWNER/NAME on the hub"
+        raise fail(key, expected=expected, got=model)
+    folder = downloaded(key, model, revision or None, needed)
+    return TransformerFolder(key, model, folder, folder.name)
 
 
 @cache  # every job of a sweep needs the model, and asking the hub takes time
@@ -85,7 +76,10 @@ def downloaded(key: str, name: str, revision: str | None, needed: tuple[str, ...
 class TransformerFolder:
     """A model that was found on this disk."""
 
-    source: TransformerSource
+    # The setting that names the model, such as "metric.clip_score.model", with which messages begin. It is
+    # not compared, because the models of several metrics may be the same.
+    key: str = field(compare=False)
+    model: str  # the folder as it was named, or OWNER/NAME on the hub
     folder: Path
     revision: str | None  # the commit on the hub; None for a folder of the user
 
@@ -135,11 +129,11 @@ class TransformerFolder:
 
     def facts(self) -> dict[str, Any]:
         """Return what the record of a number says about the model."""
-        return model_facts(self.source.model, self.revision, self.weights())
+        return model_facts(self.model, self.revision, self.weights())
 
     def damaged(self, problem: str) -> UserError:
         """Return the error for a model that was found but cannot be used."""
-        return UserError(f"{self.source.key}: {self.source.model} cannot be used: {problem}")
+        return UserError(f"{self.key}: {self.model} cannot be used: {problem}")
 
 
 def model_facts(model: str, revision: str | None, weights: Sequence[Path]) -> dict[str, Any]:

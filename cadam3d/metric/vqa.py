@@ -1,7 +1,7 @@
 """Vqa: how sure a vision-language model is that a picture shows the prompt."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -14,7 +14,7 @@ from cadam3d.io.image import to_uint8
 from cadam3d.io.pretrained import DTYPES
 from cadam3d.metric import transformer
 from cadam3d.metric.scoring import ModelMetric, Scorer
-from cadam3d.metric.transformer import TransformerFolder, TransformerSource, kept
+from cadam3d.metric.transformer import TransformerFolder, kept
 
 # Chat templates and the vocabularies of older models are in separate files.
 NEEDED = (*transformer.NEEDED, "*.jinja", "tokenizer.model")
@@ -74,6 +74,7 @@ class Vqa(ModelMetric):
         ),
     )
     kind: ClassVar[str] = "vqa"
+    needed: ClassVar[tuple[str, ...]] = NEEDED
 
     question: str  # {} is the text of the protocol
     dtype: Annotated[str, one_of(DTYPES)]  # of the weights
@@ -83,17 +84,13 @@ class Vqa(ModelMetric):
         is_question = self.question.count(PLACE) == 1
         require(is_question, f"{self.node}.question", expected=f"a text with {PLACE} once", got=self.question)
 
-    def source(self) -> TransformerSource:
-        """Return the place of the model. Raises ``UserError`` if neither metric nor protocol names one."""
-        return replace(super().source(), needed=NEEDED)
-
     def check_model(self, found: TransformerFolder) -> None:
         """Read the processor, and check that there are a chat template and tokens that spell yes."""
         _reader(found)
 
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture a score in [0, 1]."""
-        found = self.source().find()
+        found = self.find()
         answerer = kept(_loaded, found, found.facts()["weights_sha256"], self.dtype, device)
 
         def score(images: Tensor, text: str) -> Tensor:
