@@ -29,20 +29,12 @@ def write_declarations(folder: Path, charts: Sequence[Chart]) -> None:
 
 
 def read_declarations(folder: Path) -> tuple[Chart, ...]:
-    """Return the charts that the run in ``folder`` declared; those that cannot be read are left out."""
-    try:
-        content = read_json(folder / CHARTS)
-    except UserError:
-        return ()
+    """Return the charts that the run in ``folder`` declared; none if the file cannot be read."""
     from pydantic import TypeAdapter  # takes a tenth of a second to load
 
-    found, adapter = [], TypeAdapter(Chart)
-    for entry in content if isinstance(content, list) else []:
-        try:
-            chart = adapter.validate_python(entry)
-        except ValueError:
-            continue
-        # A score becomes the name of files.
-        if not chart.score or chart.score.isidentifier():
-            found.append(chart)
-    return tuple(found)
+    try:
+        charts = TypeAdapter(tuple[Chart, ...]).validate_python(read_json(folder / CHARTS))
+    except (UserError, ValueError):
+        return ()
+    # A score becomes the name of files.
+    return tuple(chart for chart in charts if not chart.score or chart.score.isidentifier())
