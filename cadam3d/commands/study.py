@@ -34,7 +34,6 @@ from cadam3d.io.run_folder import (
     typed_path,
 )
 from cadam3d.io.text_tables import bullets
-from cadam3d.report.formatting import plural
 from cadam3d.settings.compose import Call
 from cadam3d.study.answers import collect, find_files, read_files
 from cadam3d.study.clips import LEAST_VISIBLE, ClipSettings, film, ruined
@@ -141,9 +140,8 @@ def _write_page(
         temporary.write_text(page, encoding="utf-8")
     write_key(folder / KEY, study, plan, seed=cfg.seed)
     for (one, other), count in sorted(Counter(pair.arms for pair in pairs).items()):
-        show(f"{one} and {other}: {plural(count, 'pair')}")
-    trials = plural(len(plan.trials), "trial")
-    show(f"{trials}, of which {plural(catches, 'catch trial')}; {len(page) / 1e6:.1f} MB")
+        show(f"{one} and {other}: {count} pair(s)")
+    show(f"{len(plan.trials)} trial(s), of which {catches} are catch trials; {len(page) / 1e6:.1f} MB")
     show(f"for the raters:  {shown(folder / PAGE)}")
     show(f"keep it secret:  {shown(folder / KEY)}")
 

@@ -82,8 +82,7 @@ class Exporter(Declared, ABC):
         degree, highest = gaussians.sh_degree, self.max_degree
         if highest is None or degree <= highest:
             return None
-        lost = f"degree {degree}" if degree == highest + 1 else f"degrees {highest + 1} to {degree}"
-        return f"{self.file_name} has SH degree {highest}, so it loses {lost}"
+        return f"{self.file_name} has SH degree {highest} at most, got {degree}"
 
 
 def suffix_in(name: str) -> str:
@@ -103,8 +102,7 @@ def exporters_by_suffix(classes: Mapping[str, type[Exporter]]) -> dict[str, list
 def gaussians_in(gaussians: Gaussians, *, up: str | None, sh_degree: int) -> Contents:
     """Return the contents of a file with all ``gaussians``."""
     count = len(gaussians)
-    words = f"{count:,} Gaussian{'' if count == 1 else 's'}"
-    return Contents(words=words, up=up, gaussians=count, sh_degree=sh_degree)
+    return Contents(words=f"{count:,} Gaussians", up=up, gaussians=count, sh_degree=sh_degree)
 
 
 @dataclass(frozen=True, kw_only=True)

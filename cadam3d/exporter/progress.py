@@ -15,7 +15,7 @@ from cadam3d.core.rendering import RenderFn
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.caption import Caption, side_by_side
 from cadam3d.io.image import read_png, step_pictures
-from cadam3d.io.records import read_metrics
+from cadam3d.io.records import counts, read_metrics
 from cadam3d.io.run_folder import PREVIEWS, shown, typed_path
 from cadam3d.io.video import CODECS, FORMATS, write_video
 
@@ -51,11 +51,11 @@ class ProgressExporter(Exporter):
                 f"{shown(run)}: has no {PREVIEWS}/. Try: cadam3d train callback.previews.every=20"
             )
         path = folder / self.file_name
-        write_video(path, self._frames(pictures, counts_in(run)), fps=self.fps)
+        write_video(path, self._frames(pictures, counts(read_metrics(run))), fps=self.fps)
         return [path]
 
     def _frames(
-        self, pictures: Sequence[tuple[int, Path]], counts: Sequence[tuple[int, int]]
+        self, pictures: Sequence[tuple[int, Path]], counts: Sequence[tuple[int, float]]
     ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
         frame = None
         for step, path in pictures:
@@ -71,23 +71,10 @@ class ProgressExporter(Exporter):
             yield frame
 
 
-def counts_in(run: Path) -> list[tuple[int, int]]:
-    """Return steps and the numbers of Gaussians after them, in order, from the log of the run in ``run``."""
-    counts = []
-    for line in read_metrics(run):
-        count = line.get("after" if line["kind"] == "refine" else "num_gaussians")
-        if isinstance(count, int):
-            counts.append((line["step"], count))
-    return sorted(counts, key=lambda each: each[0])
-
-
-def count_at(step: int, counts: Sequence[tuple[int, int]]) -> str:
-    """Return the number of Gaussians after ``step`` as text; "" if the log does not have it.
-
-    Only refinements change the number, and each of them has a line of its own.
-    """
+def count_at(step: int, counts: Sequence[tuple[int, float]]) -> str:
+    """Return the number of Gaussians after ``step`` as text; "" if the log does not have it."""
     earlier = [count for at, count in counts if at <= step]
-    return f"{earlier[-1]:,} Gaussians" if earlier else ""
+    return f"{earlier[-1]:,.0f} Gaussians" if earlier else ""
 
 
 def fitted(picture: UInt8[np.ndarray, "h w 3"], shape: tuple[int, ...]) -> UInt8[np.ndarray, "h2 w2 3"]:

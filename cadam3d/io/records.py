@@ -200,6 +200,20 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
     return [line for line in read_jsonl(run / METRICS) if _is_metrics(line)]
 
 
+def counts(lines: Iterable[Mapping[str, Any]]) -> list[tuple[int, float]]:
+    """Return steps and Gaussians over time from lines of ``metrics.jsonl``, in order.
+
+    A refinement is two points at its step. The line of a step holds the count before its refinement.
+    """
+    points = [
+        (line["step"], order, line[key])
+        for line in lines
+        for key, order in (("num_gaussians", 0), ("before", 0), ("after", 1))
+        if is_number(line.get(key))
+    ]
+    return [(step, value) for step, _, value in sorted(points)]
+
+
 def read_histograms(run: Path) -> list[dict[str, Any]]:
     """Return the lines of ``histograms.jsonl``; lines with entries of another kind are left out.
 

@@ -33,7 +33,7 @@ class Clip:
         rounded = (images.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
         pixels = self.preprocess(images=list(rounded), return_tensors="pt", input_data_format="channels_last")
         pixel_values = pixels["pixel_values"].to(self._device)
-        return normalize(_vectors(self.model.get_image_features(pixel_values=pixel_values)), dim=-1)
+        return normalize(self.model.get_image_features(pixel_values=pixel_values).pooler_output, dim=-1)
 
     def texts(self, texts: Sequence[str]) -> Float[Tensor, "t d"]:
         """Return a unit vector for each text. Long texts are cut off (see :meth:`complaints`)."""
@@ -43,7 +43,7 @@ class Clip:
         features = self.model.get_text_features(
             input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"]
         )
-        return normalize(_vectors(features), dim=-1)
+        return normalize(features.pooler_output, dim=-1)
 
     def complaints(self, text: str) -> tuple[str, ...]:
         """Return a warning about a text that is too long for the model; none if it reads all of it."""
@@ -121,12 +121,5 @@ def check_clip(found: TransformerFolder) -> tuple[Any, Any]:
     if len(tokenizer) < found.read(transformers.CLIPConfig).text_config.vocab_size / 2:
         raise found.damaged("files of its tokenizer are missing")
     # This class resizes with Pillow, as the published models were trained. With torchvision, transformers
-    # would prefer another class that rounds differently. Older versions have one class, under another name.
-    name = "CLIPImageProcessorPil"
-    name = name if hasattr(transformers, name) else "CLIPImageProcessor"
-    return tokenizer, found.read(getattr(transformers, name))
-
-
-def _vectors(output: Any) -> Float[Tensor, "n d"]:
-    """Return the vectors of a call that returns them alone, or with the states before their projection."""
-    return output if isinstance(output, Tensor) else output.pooler_output
+    # would prefer another class that rounds differently.
+    return tokenizer, found.read(transformers.CLIPImageProcessorPil)

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from cadam3d.core.chart import Chart, Curve
 from cadam3d.core.palette import SERIES_COLORS, SOFT
 from cadam3d.io.declarations import GAUSSIANS, LOSS
+from cadam3d.io.records import counts
 from cadam3d.report.formatting import number
 from cadam3d.report.style import inline, label_axis, styled, svg_of
 
@@ -79,17 +80,6 @@ def lines_of(metrics: Lines) -> tuple[list[Mapping[str, Any]], list[Mapping[str,
         {key: value for key, value in line.items() if key != "statistics"} | (line.get("statistics") or {})
         for line in refinements
     ]
-
-
-def counts(metrics: Lines) -> list[Point]:
-    """Return steps and Gaussians over time; a refinement is two points at its step.
-
-    The line of a step holds the count before the refinement of that step.
-    """
-    points: list[tuple[float, int, float]] = []
-    for key, order in (("num_gaussians", 0), ("before", 0), ("after", 1)):
-        points += [(step, order, value) for step, value in _points(metrics, key)]
-    return [(step, value) for step, _, value in sorted(points)]
 
 
 def draw(chart: Chart, lines: Lines, last_step: float) -> DrawnChart | None:

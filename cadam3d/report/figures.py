@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 
 from cadam3d.core.number import Number
 from cadam3d.core.palette import INK
-from cadam3d.io.records import read_metrics
-from cadam3d.report.charts import Point, counts
+from cadam3d.io.records import counts, read_metrics
+from cadam3d.report.charts import Point
 from cadam3d.report.compare import (
     FrontierPoint,
     arms_without_growth,

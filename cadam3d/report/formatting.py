@@ -32,8 +32,3 @@ def short(value: float) -> str:
 def elapsed(seconds: float) -> str:
     """Return a time span: seconds with one decimal below a minute, else such as ``1:02:03``."""
     return f"{seconds:.1f} s" if seconds < 60 else str(timedelta(seconds=round(seconds)))
-
-
-def plural(count: int, noun: str) -> str:
-    """Return ``1 job`` or ``3 jobs``."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

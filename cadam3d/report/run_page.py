@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.number import preferred
+from cadam3d.core.number import COUNT, preferred
 from cadam3d.io.declarations import read_declarations
 from cadam3d.io.html import data_url, encoded, source
 from cadam3d.io.ply import read_ply
@@ -24,11 +24,8 @@ LARGEST = 8 * MIB  # of all snapshots in a page; base64 makes a third more of th
 FILES = (ASSET, TURNTABLE, PREVIEW, SUMMARY, METRICS, CONFIG)
 HIDDEN = ("warnings", MEASUREMENTS, NUMBERS)  # entries of the summary that are no facts
 COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "device")
-# Entries of the summary, in the order of the page. Those that are not here follow under their own names.
+# Labels of entries of the summary. The others have their own names.
 LABELS = {
-    "prompt": "Prompt",
-    "negative_prompt": "Negative prompt",
-    "outcome": "Outcome",
     "num_gaussians_initial": "Gaussians at the start",
     "initializer_note": "Fallback of the initializer",
     "backend": "Rasterizer backend",
@@ -76,19 +73,15 @@ def write(folder: Path) -> Path:
     )
 
 
-def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """Return the numbers that matter most, as far as they are known: a label, a value and a remark."""
-    found = {name: value for name in summary if (value := number(summary[name])) is not None}
-    tiles = []
-    if (count := found.get("num_gaussians")) is not None:
-        initial = found.get("num_gaussians_initial")
-        tiles.append(("Gaussians", f"{count:,.0f}", "" if initial is None else f"from {initial:,.0f}"))
-    for each in preferred(each for each in declared(summary).values() if each.name in found)[:1]:
-        tiles.append((each.label, each.written(found[each.name]), ""))
-    if (size := found.get("asset_bytes")) is not None:
-        tiles.append((ASSET, f"{size / MIB:.2f} MiB", ""))
-    if (seconds := found.get("seconds")) is not None:
-        tiles.append(("Time", elapsed(seconds), f"{found.get('steps', 0):,.0f} steps"))
+def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the numbers that matter most, as far as they are known: a label and a value."""
+    known = [each for each in declared(summary).values() if number(summary.get(each.name)) is not None]
+    shown = [each for each in known if each == COUNT] + preferred(known)[:1]
+    tiles = [(each.label, each.written(summary[each.name])) for each in shown]
+    if (size := number(summary.get("asset_bytes"))) is not None:
+        tiles.append((ASSET, f"{size / MIB:.2f} MiB"))
+    if (seconds := number(summary.get("seconds"))) is not None:
+        tiles.append(("Time", elapsed(seconds)))
     return tiles
 
 
@@ -120,11 +113,10 @@ def _video_source(path: Path) -> str:
 
 
 def _facts(summary: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Return the label and the value of every fact, the known ones first."""
+    """Return the label and the value of every fact."""
     labels = LABELS | {name: each.fact for name, each in declared(summary).items()}
-    ordered = [*(key for key in labels if key in summary), *(key for key in summary if key not in labels)]
     return [
-        (labels.get(key) or key.capitalize().replace("_", " "), summary[key])
-        for key in ordered
+        (labels.get(key) or key.capitalize().replace("_", " "), value)
+        for key, value in summary.items()
         if key not in HIDDEN
     ]

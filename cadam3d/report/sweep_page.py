@@ -15,7 +15,6 @@ from cadam3d.core.outcome import Outcome
 from cadam3d.io.jsonl import read_json
 from cadam3d.io.run_folder import CHOICE, FIGURES, REPORT, TABLE
 from cadam3d.report import figures, strips, tables
-from cadam3d.report.formatting import plural
 from cadam3d.report.pages import table, write_page
 from cadam3d.report.paper_formats import FORMATS, read_table
 from cadam3d.report.results import PROMPT, JobResult, measured, read
@@ -161,7 +160,7 @@ def _drawn(results: Results, name: str, kind: FigureKind, folder: Path) -> str:
 def _title(plan: Plan, results: Results) -> str:
     """Return the name of the grid, if there is one, and the prompts."""
     grids = [str(word).partition("=")[2].strip("'\"") for word in plan.line if key_of(str(word)) == "grid"]
-    name = next(filter(None, grids), "Sweep") if plan.command == "sweep" else plural(len(results), "attempt")
+    name = next(filter(None, grids), "Sweep") if plan.command == "sweep" else f"{len(results)} attempts"
     prompts = ", ".join(filter(None, dict.fromkeys(result.cell[PROMPT] for result in results)))
     return f"{name}: {shorten(prompts, LONGEST_PROMPTS, placeholder=' ...')}" if prompts else name
 

@@ -74,7 +74,7 @@ def fails(trial: dict, names: list[str]) -> int:
 def test_the_page_says_nothing_about_arms_files_and_counts(arms, type_line, tmp_path):
     code, out, _ = type_line("study", arms, *SMALL)
     assert code == 0
-    assert "heron and ibis: 3 pairs\n5 trials, of which 2 catch trials" in out
+    assert "heron and ibis: 3 pair(s)\n5 trial(s), of which 2 are catch trials" in out
     page = (tmp_path / "study/study.html").read_text(encoding="utf-8")
     for hidden in (
         *ARMS,

@@ -7,9 +7,10 @@ import torch
 
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.exporter.progress import ProgressExporter, count_at, counts_in
+from cadam3d.exporter.progress import ProgressExporter, count_at
 from cadam3d.io.image import step_picture, write_png
 from cadam3d.io.jsonl import append_jsonl
+from cadam3d.io.records import counts, read_metrics
 
 SETTINGS = {"run": None, "fps": 4, "hold": 0.5, "codec": "mp4"}
 NONE = Gaussians(
@@ -54,8 +55,8 @@ def test_without_a_run_the_previews_beside_the_video_are_shown(run):
 
 
 def test_the_count_of_a_step_is_that_of_the_last_refinement_before_it(run):
-    counts = counts_in(run)
-    texts = [count_at(step, counts) for step in (0, 1, 99, 100, 250)]
+    found = counts(read_metrics(run))
+    texts = [count_at(step, found) for step in (0, 1, 99, 100, 250)]
     assert texts == ["", "4,000 Gaussians", "4,000 Gaussians", "5,000 Gaussians", "5,000 Gaussians"]
 
 

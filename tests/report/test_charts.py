@@ -6,7 +6,8 @@ import pytest
 
 from cadam3d.core.chart import Chart, Curve
 from cadam3d.core.palette import SERIES
-from cadam3d.report.charts import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, counts, draw
+from cadam3d.io.records import counts
+from cadam3d.report.charts import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, draw
 
 
 def chart(**settings) -> Chart:

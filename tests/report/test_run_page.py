@@ -113,10 +113,9 @@ def chart_titles(folder) -> list[str]:
 
 def test_the_most_important_numbers_are_shown(tmp_path):
     text = make(tmp_path, declared(SUMMARY)).text
-    for expected in ("a red torus", "finished", "1,234", "from 2,000", "24.52 dB", "0.08 MiB"):
+    for expected in ("a red torus", "finished", "1,234", "24.52 dB", "0.08 MiB"):
         assert expected in text
     assert "0:01:15" in text
-    assert "300 steps" in text
     assert "steps: 300" in text  # the configuration
 
 
