@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import AtLeastZero, Declared, Share, Whole, require, within
+from cadam3d.core.checks import AtLeastZero, Declared, Share, Whole, within
 from cadam3d.core.rendering import RenderOutput
 
 
@@ -52,13 +52,7 @@ class BrightnessGuard(Exposure):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(
-            self.end > self.begin,
-            "exposure.end",
-            expected=f"a step after exposure.begin={self.begin}",
-            got=self.end,
-            example=f"exposure.end={self.begin + 3500}",
-        )
+        self.expect(self.end > self.begin, "end", f"a step after begin={self.begin}", self.begin + 3500)
 
     @torch.no_grad()
     def dimming(

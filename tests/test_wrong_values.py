@@ -160,7 +160,6 @@ def test_every_setting_of_every_component_refuses_what_it_cannot_use(node, file)
 
 # Numbers whose bounds depend on other settings, or that the class checks itself.
 BY_HAND = {
-    *("exporter.turntable.fps", "exporter.progress.fps", "prior.size"),
     *("prior.spread", "prior.edge_spread", "prior.model_error", "prior.samples_per_pixel"),
     *("prior.census_size", "prior.seed", "truth.samples_per_pixel", "truth.turns"),
 }

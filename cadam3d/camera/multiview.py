@@ -46,12 +46,8 @@ class Multiview(CameraSampler):
     def __post_init__(self) -> None:
         super().__post_init__()
         least = OUTSIDE * math.tan(math.radians(self.fov_y_deg[1]) / 2)
-        require(
-            self.relative_distance[0] >= least,
-            "camera.relative_distance",
-            expected=f"at least {least:.3g} at {self.fov_y_deg[1]:g} degrees, outside the unit ball",
-            got=self.relative_distance,
-        )
+        expected = f"at least {least:.3g} at {self.fov_y_deg[1]:g} degrees, outside the unit ball"
+        self.expect(self.relative_distance[0] >= least, "relative_distance", expected)
 
     def check_views(self, views: int) -> None:
         """Raise ``UserError`` unless ``views`` is a multiple of four."""

@@ -167,6 +167,12 @@ class Declared:
                 for each in values:
                     check(f"{type(self).__name__}.{name}", each)
 
+    def expect(self, claim: bool, name: str, expected: str, example: object = "") -> None:
+        """Raise ``UserError`` about the field ``name`` unless ``claim`` holds; try ``example``."""
+        key = f"{type(self).__name__}.{name}"
+        line = f"{key}={example}" if example != "" else ""
+        require(claim, key, expected=expected, got=getattr(self, name), example=line)
+
 
 @cache
 def declared(cls: type) -> dict[str, tuple[tuple[Check, ...], bool]]:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from cadam3d.core.checks import Count, Declared, Positive, are_numbers, require, whole, within
+from cadam3d.core.checks import Count, Declared, Positive, are_numbers, whole, within
 
 # A step at which every schedule has its final value.
 FAR_STEP = 10**9
@@ -84,14 +84,13 @@ class Steps(Schedule):
     milestones: Sequence[int]
 
     def __post_init__(self) -> None:
-        require(
+        self.expect(
             are_numbers(self.values, low=-sys.float_info.max, high=sys.float_info.max)
             and are_numbers(self.milestones, low=-FAR_STEP, high=FAR_STEP)
             and len(self.values) == len(self.milestones) + 1
             and list(self.milestones) == sorted(self.milestones),
-            "Steps.values",
-            expected="one value more than milestones, all numbers, milestones ascending",
-            got=(self.values, self.milestones),
+            "values",
+            f"one number more than milestones, which ascend: {self.milestones}",
         )
 
     @property

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import AtLeastZero, one_of, require, within
+from cadam3d.core.checks import AtLeastZero, one_of, within
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.cadam import CAdam, CAdamState
 from cadam3d.densifier.noise_floor import snr_threshold
@@ -35,39 +35,19 @@ class CAdamOpen(CAdam):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(
-            any(gate is not None for gate in (self.tau_Q, self.tau_SNR, self.tau_m, self.alpha)),
-            "densifier.tau_m",
-            expected="a number, because no other gate limits growth",
-            got=self.tau_m,
-            example="densifier.tau_m=0.001",
-        )
-        require(
-            self.tau_reset is None or self.reset == "unreliable",
-            "densifier.tau_reset",
-            expected=f"null, because it has no effect with densifier.reset={self.reset}",
-            got=self.tau_reset,
-            example="densifier.tau_reset=null",
-        )
-        if self.alpha is not None:
-            self._check_alpha(self.alpha)
-
-    def _check_alpha(self, alpha: float) -> None:
-        require(
-            self.tau_SNR is None,
-            "densifier.tau_SNR",
-            expected=f"null, because densifier.alpha={alpha:g} sets the SNR that candidates exceed",
-            got=self.tau_SNR,
-            example="densifier.tau_SNR=null densifier.tau_reset=0.1",
-        )
+        gates = (self.tau_Q, self.tau_SNR, self.tau_m, self.alpha)
+        has_gate = any(gate is not None for gate in gates)
+        self.expect(has_gate, "tau_m", "a number, because no other gate limits growth", 0.001)
+        is_used = self.tau_reset is None or self.reset == "unreliable"
+        self.expect(is_used, "tau_reset", f"null, because it has no effect with reset={self.reset}")
+        if self.alpha is None:
+            return
+        expected = f"null, because alpha={self.alpha:g} sets the SNR that candidates exceed"
+        self.expect(self.tau_SNR is None, "tau_SNR", expected, "null")
         # A small tolerance, so that 0.81 may be written for 0.9**2.
-        require(
-            self.beta2 >= self.beta1**2 - 1e-6,
-            "densifier.beta2",
-            expected=f"at least beta1^2 = {self.beta1**2:g}, because densifier.alpha is not calibrated below",
-            got=self.beta2,
-            example=f"densifier.beta2={max(self.beta1**2, 0.99):g}",
-        )
+        least = self.beta1**2
+        expected = f"at least beta1^2 = {least:g}, because alpha is not calibrated below"
+        self.expect(self.beta2 >= least - 1e-6, "beta2", expected)
 
     @property
     def limits_drift(self) -> bool:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from cadam3d.core.checks import BelowOne, Count, Declared, Positive, Share, Whole, require, whole, within
+from cadam3d.core.checks import BelowOne, Count, Declared, Positive, Share, Whole, whole, within
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import Gaussians, concatenate
 from cadam3d.core.schedule import FAR_STEP
@@ -65,20 +65,11 @@ class Refine(Declared):
         super().__post_init__()
         if self.reset_interval is None:
             return
-        require(
-            self.min_opacity < self.reset_value or self.prune_grace > 0,
-            "refine.min_opacity",
-            expected=f"a number below refine.reset_value={self.reset_value:g}, or refine.prune_grace > 0",
-            got=self.min_opacity,
-            example=f"refine.min_opacity={self.reset_value / 2:g}",
-        )
-        require(
-            self.prune_grace < self.reset_interval,
-            "refine.prune_grace",
-            expected=f"less than refine.reset_interval={self.reset_interval}",
-            got=self.prune_grace,
-            example=f"refine.prune_grace={self.reset_interval // 2}",
-        )
+        is_kept = self.min_opacity < self.reset_value or self.prune_grace > 0
+        expected = f"a number below reset_value={self.reset_value:g}, or prune_grace > 0"
+        self.expect(is_kept, "min_opacity", expected, self.reset_value / 2)
+        is_short = self.prune_grace < self.reset_interval
+        self.expect(is_short, "prune_grace", f"less than reset_interval={self.reset_interval}", 0)
 
     @property
     def refinements(self) -> range:

@@ -7,7 +7,6 @@ from typing import Annotated, ClassVar
 
 from cadam3d.core.checks import one_of, whole
 from cadam3d.core.console import say
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.mesh.surface import SurfaceSettings
 from cadam3d.core.rendering import RenderFn
@@ -38,14 +37,10 @@ class MeshExporter(SurfaceSettings, Exporter):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.texture is None:
-            return
-        if self.format in ("ply", "stl"):
-            raise UserError(
-                f"exporter.mesh.texture: expected null with format={self.format}, which has no textures, "
-                f"got {self.texture}. Try: exporter.mesh.format=glb"
-            )
-        require_xatlas()
+        if self.texture is not None:
+            has_textures = self.format not in ("ply", "stl")
+            self.expect(has_textures, "texture", f"null, because {self.format} has no textures", "null")
+            require_xatlas()
 
     @property
     def up_axis(self) -> str:

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from jaxtyping import UInt8
 
-from cadam3d.core.checks import one_of, require_whole, within
+from cadam3d.core.checks import Count, one_of, within
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderFn
@@ -33,14 +33,14 @@ class ProgressExporter(Exporter):
     # The folder of the run; None: the folder to which this exporter writes. A list of runs, which render
     # compares, has no single folder, and ``compare`` refuses it.
     run: str | Sequence[str] | None
-    fps: int  # previews per second, in [1, 240]; for gif in [1, 50]
+    fps: Count  # previews per second
     hold: Annotated[float, within(low=0, high=LONGEST_HOLD)]  # seconds that the last preview stays
     codec: Annotated[str, one_of(CODECS)]
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        high = FORMATS[f".{self.codec}"].most_fps
-        require_whole("exporter.progress.fps", self.fps, low=1, high=high)
+        most = FORMATS[f".{self.codec}"].most_fps
+        self.expect(self.fps <= most, "fps", f"at most {most} with codec={self.codec}", most)
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
         """Read the previews one by one and encode them; the Gaussians are not rendered."""

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import UInt8
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import Elevation, fail, one_of, require, require_whole, whole, within
+from cadam3d.core.checks import Count, Elevation, one_of, require, whole, within
 from cadam3d.core.pictures import CutoutSettings, Views
 from cadam3d.core.rendering import Subject
 from cadam3d.exporter.pictures import PictureExporter, captions_of, paint, paper_of
@@ -37,17 +37,17 @@ class TurntableExporter(CutoutSettings, PictureExporter):
     views: Views  # frames
     turns: Annotated[float, within(low=-MOST_TURNS, high=MOST_TURNS)]  # negative = the other way round
     elevation_deg: Elevation
-    fps: int  # frames per second, in [1, 240]; for gif in [1, 50]
+    fps: Count  # frames per second
     codec: Annotated[str, one_of(CODECS)]
     beside: Annotated[str, one_of(("depth", "alpha", "normal", "none"))]
 
     def __post_init__(self) -> None:
         super().__post_init__()
         kind = FORMATS[f".{self.codec}"]
-        require_whole("exporter.turntable.fps", self.fps, low=1, high=kind.most_fps)
-        if self.is_transparent and kind.transparent_pixels is None:
-            expected, example = "webm, because the background is transparent", "exporter.turntable.codec=webm"
-            raise fail("exporter.turntable.codec", expected=expected, got=self.codec, example=example)
+        most = kind.most_fps
+        self.expect(self.fps <= most, "fps", f"at most {most} with codec={self.codec}", most)
+        is_possible = kind.transparent_pixels is not None or not self.is_transparent
+        self.expect(is_possible, "codec", "webm, because the background is transparent", "webm")
 
     def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
         """Render and encode frame by frame."""

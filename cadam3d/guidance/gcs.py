@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.chart import Chart, Curve
-from cadam3d.core.checks import AtLeastZero, Positive, one_of, require, within
+from cadam3d.core.checks import AtLeastZero, Positive, one_of, within
 from cadam3d.core.device import upload_together
 from cadam3d.core.schedule import Schedule, as_schedule
 from cadam3d.guidance.base import GuidanceOutput
@@ -104,9 +104,7 @@ class GCS(WindowedGuidance):
     def __post_init__(self) -> None:
         super().__post_init__()
         is_any = max(self.w_cc, self.w_gc, self.w_cp) > 0
-        require(
-            is_any, "guidance.w_gc", expected="a number > 0, since w_cc and w_cp are 0 as well", got=self.w_gc
-        )
+        self.expect(is_any, "w_gc", "a number > 0, since w_cc and w_cp are 0 as well")
 
     def __call__(
         self,

@@ -82,14 +82,8 @@ class FromObject(FromPoints):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.factor is not None:
-            require(
-                self.radius is None,
-                "initializer.radius",
-                expected=f"null or initializer.factor=null, since factor {self.factor:g} sets the size",
-                got=self.radius,
-                example="initializer.radius=null",
-            )
+        is_one = self.factor is None or self.radius is None
+        self.expect(is_one, "radius", f"null, since factor={self.factor} sets the size", "null")
 
     def placed(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], float]:
         """Return points of the object, which is upright, in the world, and the factor of their distances.

@@ -15,7 +15,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import require
 from cadam3d.core.pictures import Elevations, PictureSettings, Views
 from cadam3d.core.rendering import RenderFn
 
@@ -40,7 +39,7 @@ class Protocol(PictureSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         is_text = self.text.count(PROMPT) == 1
-        require(is_text, "protocol.text", expected=f"a text with {PROMPT} once", got=self.text)
+        self.expect(is_text, "text", f"a text with {PROMPT} once")
 
     @cached_property
     def cameras(self) -> Cameras:

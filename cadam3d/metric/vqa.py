@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import one_of, require
+from cadam3d.core.checks import one_of
 from cadam3d.core.number import Number
 from cadam3d.io.image import to_uint8
 from cadam3d.io.pretrained import DTYPES
@@ -82,7 +82,7 @@ class Vqa(ModelMetric):
     def __post_init__(self) -> None:
         super().__post_init__()
         is_question = self.question.count(PLACE) == 1
-        require(is_question, f"{self.node}.question", expected=f"a text with {PLACE} once", got=self.question)
+        self.expect(is_question, "question", f"a text with {PLACE} once")
 
     def check_model(self, found: TransformerFolder) -> None:
         """Read the processor, and check that there are a chat template and tokens that spell yes."""

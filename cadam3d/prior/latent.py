@@ -104,7 +104,7 @@ class LatentPrior(DiffusionPrior):
     revision: str | None  # on the hub
     variant: str | None  # of weight files
     prompting: Prompting
-    size: int | None  # pixels per side
+    size: Count | None  # pixels per side
     noise_levels: Annotated[str, one_of(LEVELS)]
     dtype: Annotated[str, one_of(("auto", *DTYPES))]
     vae_dtype: Annotated[str, one_of(("auto", "bfloat16", "float32"))]
@@ -121,10 +121,8 @@ class LatentPrior(DiffusionPrior):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.size is not None:
-            unit = 2 * FACTOR
-            is_possible = self.size > 0 and self.size % unit == 0
-            require(is_possible, "prior.size", expected=f"a multiple of {unit}", got=self.size)
+        unit = 2 * FACTOR
+        self.expect((self.size or 0) % unit == 0, "size", f"a multiple of {unit}")
 
     # --- methods that a family of models implements ---------------------------------------------------------
 

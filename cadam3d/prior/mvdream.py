@@ -55,13 +55,8 @@ class MVDream(StableDiffusion):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(
-            self.micro_batch is None or self.micro_batch % VIEWS == 0,
-            "prior.micro_batch",
-            expected=f"null or a multiple of {VIEWS}, since {VIEWS} views are denoised together",
-            got=self.micro_batch,
-            example=f"prior.micro_batch={VIEWS}",
-        )
+        expected = f"null or a multiple of {VIEWS}, since {VIEWS} views are denoised together"
+        self.expect((self.micro_batch or 0) % VIEWS == 0, "micro_batch", expected, VIEWS)
 
     @cached_property
     def found(self) -> Pretrained:

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import Count, Declared, Positive, require_range, within
+from cadam3d.core.checks import Count, Declared, Positive, within
 from cadam3d.core.device import upload
 
 # Bisections until an interval of length 1 reaches the resolution of double precision.
@@ -110,11 +110,11 @@ class DDPM(NoisePath):
 
     train_steps: Count = 1000
     beta_start: Annotated[float, within(above=0, below=1)] = 0.00085
-    beta_end: float = 0.012
+    beta_end: Annotated[float, within(above=0, below=1)] = 0.012
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_range("prior.noise_path.beta_end", self.beta_end, low=self.beta_start, below=1)
+        self.expect(self.beta_end >= self.beta_start, "beta_end", f"at least beta_start={self.beta_start:g}")
 
     def a(self, t: PerView) -> PerView:
         """Return sqrt(alpha_bar), which is 1 at t = 0."""

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import Declared, Elevation, one_of, require, within
+from cadam3d.core.checks import Declared, Elevation, one_of, within
 from cadam3d.prior.path import PerView
 
 FRONT, SIDE, BACK, OVERHEAD = range(4)
@@ -77,13 +77,8 @@ class Discrete(Prompting):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(
-            self.front_deg + self.back_deg <= 180,
-            "prompting.back_deg",
-            expected=f"at most {180 - self.front_deg:g}, since front_deg + back_deg <= 180",
-            got=self.back_deg,
-            example="prompting.back_deg=45",
-        )
+        most = 180 - self.front_deg
+        self.expect(self.back_deg <= most, "back_deg", f"at most {most:g}, as front_deg={self.front_deg:g}")
 
     def texts(self, prompt: str) -> list[str]:
         """Return the prompt with each of the four suffixes."""
@@ -108,13 +103,8 @@ class Compass(Prompting):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(
-            self.below_deg <= self.above_deg,
-            "prompting.above_deg",
-            expected=f"at least prompting.below_deg, {self.below_deg:g}",
-            got=self.above_deg,
-            example="prompting.above_deg=35",
-        )
+        expected = f"at least below_deg={self.below_deg:g}"
+        self.expect(self.above_deg >= self.below_deg, "above_deg", expected)
 
     def texts(self, prompt: str) -> list[str]:
         """Return the prompt with the words of every side and height."""

@@ -271,10 +271,10 @@ def test_gaussians_moments_and_densifier_state_stay_in_step_through_many_edits(d
 
 
 def test_a_reset_below_the_pruning_threshold_is_refused():
-    with pytest.raises(UserError, match=r"refine\.min_opacity.*Try: refine\.min_opacity=0\.005$"):
+    with pytest.raises(UserError, match=r"\.min_opacity: .*Try: Refine\.min_opacity=0\.005$"):
         refine(reset_interval=300, min_opacity=0.05)
 
 
 def test_a_grace_as_long_as_the_reset_interval_is_refused():
-    with pytest.raises(UserError, match=r"refine\.prune_grace.*refine\.reset_interval=300"):
+    with pytest.raises(UserError, match=r"\.prune_grace: .* reset_interval=300"):
         refine(reset_interval=300, prune_grace=300)

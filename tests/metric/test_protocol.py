@@ -31,16 +31,10 @@ def test_the_pictures_are_those_of_the_renderer():
     assert all(torch.equal(images, pictures) for images in RING.images(lambda *_: output(pictures)))
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"text": "no place"}, "protocol.text"),
-        ({"text": "{} and {}"}, "protocol.text"),
-    ],
-)
-def test_wrong_values_are_named(change, message):
-    with pytest.raises(UserError, match=message):
-        replace(RING, **change)
+@pytest.mark.parametrize("text", ["no place", "{} and {}"])
+def test_a_text_has_one_place_for_the_prompt(text):
+    with pytest.raises(UserError, match=r"^RingProtocol\.text: expected a text with {} once"):
+        replace(RING, text=text)
 
 
 @pytest.mark.parametrize(
