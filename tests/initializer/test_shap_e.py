@@ -300,7 +300,5 @@ def test_the_fallback_gives_the_same_gaussians_as_without_shap_e(models, seed):
 
 
 def test_the_size_has_one_setting():
-    with pytest.raises(
-        UserError, match=r"\.radius: expected null, since factor=2\.0 .* Try: .*=null$"
-    ):
+    with pytest.raises(UserError, match=r"\.radius: expected null, since factor=2\.0 .* Try: .*=null$"):
         shap_e(factor=2.0)
