@@ -19,13 +19,11 @@ from cadam3d.core.checks import fail, require, require_choice, require_whole
 from cadam3d.core.errors import UserError
 from cadam3d.core.schedule import FAR_STEP
 from cadam3d.densifier.base import Densifier
-from cadam3d.densifier.baseline import Baseline
 from cadam3d.densifier.refine import Refine
 from cadam3d.exposure import Exposure
 from cadam3d.guidance.base import Guidance
 from cadam3d.optimizer import AdamSettings
 from cadam3d.prior.base import DiffusionPrior
-from cadam3d.prior.prompting import Prompting
 from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.regularizer import Regularizer
 from cadam3d.settings.check import require_declared
@@ -56,7 +54,6 @@ def build_trainer(
         require(is_right, name, expected=f"an object of class {kind.__name__}", got=given[name])
         return given[name]
 
-    require_unused(cfg)
     require_whole("steps", cfg.steps, low=1, high=FAR_STEP)
     refine: Refine = part("refine", Refine)
     require(
@@ -82,17 +79,6 @@ def build_trainer(
         regularizers=components(cfg.regularizer, Regularizer, "regularizer"),
         callbacks=[*components(cfg.callback, Callback, "callback").values(), *callbacks],
     )
-
-
-def require_unused(cfg: DictConfig) -> None:
-    """Raise ``UserError`` for wrong values of settings that some priors or densifiers do not read."""
-    component(cfg.prompting, Prompting, "prompting")
-    key, published = "published_baseline", cfg.published_baseline
-    is_node = OmegaConf.is_dict(published) and not OmegaConf.is_missing(cfg, key) and published is not None
-    example = f"'{key}.views=sum_norm'"
-    require(is_node, key, expected="the keys of a node", got=published, example=example)
-    target = {TARGET: f"{Baseline.__module__}.{Baseline.__name__}", "screen_px": None}
-    component(_node_at(key, target | _content(published, key)), Baseline, key)
 
 
 def component(node: Any, kind: type = object, key: str = CONFIGURATION) -> Any:

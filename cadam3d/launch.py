@@ -84,9 +84,8 @@ def completing() -> Iterator[None]:
     except OSError as error:
         if error.errno not in (errno.ENAMETOOLONG, errno.ELOOP):
             raise
-        expected = f"one that this system accepts ({error.strerror})"
-        got = str(error.filename)[:60]
-        raise fail("path", expected=expected, got=got, example="a shorter one") from error
+        expected = f"one without this problem: {error.strerror}"
+        raise fail("path", expected=expected, got=error.filename, example="a shorter one") from error
 
 
 @contextmanager

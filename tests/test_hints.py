@@ -47,7 +47,6 @@ LINES = [
     ((*TRAIN, "prompt=a red florb"), "florb"),
     ((*TRAIN, "refine.steps=5"), "refine.steps: expected the length of the run"),
     ((*TRAIN, "guidance._target_=os.system"), "guidance._target_"),
-    ((*TRAIN, "published_baseline=null"), "published_baseline: expected the keys of a node"),
     ((*TRAIN, "steps=${nope}"), "steps: Interpolation key 'nope' not found"),
     ((*TRAIN, "steps=${oc.env:CADAM3D_NOT_SET}"), "steps: "),
     ((*TRAIN, "attempts=0"), "attempts: expected"),

@@ -56,7 +56,7 @@ def run(cfg: DictConfig, line: Line) -> int:
         names = [each.name for each in preferred(numbers.values())] if select is None else [select]
         # The last of several needs no truth.
         again = measuring_line(ended.folder, numbers[names[-1]])
-        raise UserError(f"select: no attempt has {' or '.join(names)}. Measure them first. Try: {again}")
+        raise UserError(f"select: no attempt has {' or '.join(names)}. Try: {again}")
     return ended.code
 
 

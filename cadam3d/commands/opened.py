@@ -1,6 +1,5 @@
 """Opened assets: the results of a run, or a single file, for all commands that use them."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from torch import Tensor
 from cadam3d.build import component
 from cadam3d.commands.messages import note_backend
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import require_choice
+from cadam3d.core.checks import require, require_choice
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
@@ -29,7 +28,6 @@ from cadam3d.io.run_folder import (
     typed_path,
 )
 from cadam3d.rasterizer.base import Rasterizer, render_fn
-from cadam3d.sweep.folder import is_sweep
 
 
 @dataclass(frozen=True)
@@ -81,15 +79,9 @@ def open_run(folder: Path, device: str) -> OpenedAsset:
 def find_run(text: str) -> Path:
     """Return the folder of the run that ``text`` names. Raises ``UserError`` if it does not hold a run."""
     folder = typed_path(text)
-    if has_file(folder, CONFIG):
-        return folder
-    if not os.path.lexists(folder):
-        reason = "no such folder"
-    elif is_sweep(folder):
-        reason = "it is a sweep, which has many runs"
-    else:
-        reason = f"it has no {CONFIG}"
-    raise UserError(f"run: expected the folder of a run, got {text!r} ({reason}). Try: run={LATEST}")
+    expected = f"the folder of a run, with a {CONFIG}"
+    require(has_file(folder, CONFIG), "run", expected=expected, got=text, example=f"run={LATEST}")
+    return folder
 
 
 def renderer(rasterizer: DictConfig, gaussians: Gaussians) -> RenderFn:

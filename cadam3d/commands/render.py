@@ -33,8 +33,6 @@ def run(cfg: DictConfig, _call: Call) -> None:
         outputs, subjects = _compare(cfg)
         of = "; ".join(f"{each.label}: {len(each.gaussians)} Gaussians" for each in subjects)
     else:
-        if cfg.labels is not None:
-            raise UserError("labels: expected null for a single asset, which has no label. Try: labels=null")
         asset = open_asset(cfg)
         outputs, of = export(cfg, asset, "render", has_record=False), f"{len(asset.gaussians)} Gaussians"
     show(f"{len(outputs)} file(s) of {of}:")

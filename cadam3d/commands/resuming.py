@@ -38,23 +38,10 @@ def start_or_resume(
     else:
         say(f"No checkpoint in {folder / CHECKPOINTS} yet: starting at step 0.")
         return trainer.start(cfg.prompt, initializer, cfg.seed, device)
-    require(
-        cfg.seed == state.seed,
-        "seed",
-        expected=f"{state.seed}, with which this run was started",
-        got=cfg.seed,
-        example=f"seed={state.seed}",
-    )
-    require(
-        state.step <= trainer.steps,
-        "steps",
-        expected=f"at least {state.step}, which {path.name} has done already",
-        got=trainer.steps,
-        example=f"steps={state.step}",
-    )
+    require(cfg.seed == state.seed, "seed", expected=f"{state.seed} as in {path.name}", got=cfg.seed)
+    steps = f"at least {state.step}, which {path.name} has done"
+    require(state.step <= trainer.steps, "steps", expected=steps, got=trainer.steps)
     note_changes(cfg, folder)
-    if state.step == trainer.steps:
-        say(f"{path.name} has all {state.step} steps; writing the outputs again.")
     return state
 
 

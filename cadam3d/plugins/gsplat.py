@@ -24,8 +24,7 @@ from torch.optim import Optimizer
 from cadam3d.core.checks import require, require_range, require_whole
 from cadam3d.densifier.cadam import CAdam, CAdamState
 from cadam3d.plugins.opacity import reset_opacities
-from cadam3d.plugins.settings import CAdamSettings
-from cadam3d.plugins.tracker import dense
+from cadam3d.plugins.tracker import CAdamSettings, dense
 
 # The rows of the state that CAdam keeps, as in CAdamState.
 MOMENTS = ("m", "v", "age")
@@ -58,25 +57,7 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
         require_whole("refine_every", self.refine_every, low=1)
         require_whole("reset_every", self.reset_every, low=1)
         require_range("prune_opa", self.prune_opa, low=0, below=1 / RESET_OVER_PRUNE)
-        require(
-            self.prune_opa > 0 or self.reset == "none",
-            "prune_opa",
-            expected=f'more than 0, because reset="{self.reset}" lowers opacities to a multiple of it',
-            got=self.prune_opa,
-            example='prune_opa=0, reset="none"',
-        )
         self.cadam()
-        changed = [
-            name
-            for name in ("grow_grad2d", "absgrad", "key_for_gradient")
-            if getattr(self, name) != getattr(DefaultStrategy, name)
-        ]
-        if changed:
-            warnings.warn(
-                f"CAdamStrategy ignores {' and '.join(changed)}, because tau_Q and tau_SNR decide which "
-                "Gaussians grow.",
-                stacklevel=3,
-            )
 
     def cadam(self) -> CAdam:
         """Return the densifier with the current settings. Raises :class:`UserError` for a wrong value."""
@@ -150,12 +131,8 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
             observer = _Observer(optimizer, step)
             # Trainers count their steps from 0 or from 1.
             if step > 1 and state["age"] is None:
-                warnings.warn(
-                    f"CAdamStrategy starts at step {step} without moments of earlier steps, so other "
-                    "Gaussians grow than in a run without a break. If the trainer resumes, save the state "
-                    "of the strategy with the parameters, and load it too.",
-                    stacklevel=3,
-                )
+                text = f"CAdamStrategy starts at step {step} without its saved state, so others grow."
+                warnings.warn(text, stacklevel=3)
         observer.strategy, observer.state = self, state
         observer.is_stepping = False
         # A state that was loaded from a file may be on another device.
@@ -174,14 +151,8 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
         """Return whether any gradient was observed. Raises if none came for a whole refinement interval."""
         if state["age"] is not None:
             return True
-        require(
-            waited < self.refine_every,
-            "optimizers",
-            expected="the optimizers that the trainer steps, because gradients are read when "
-            'optimizers["means"].step() is called',
-            got=f"none in {waited} training steps",
-            example="strategy.step_pre_backward(params, optimizers, state, step, info)",
-        )
+        got = f"no step of optimizers['means'] in {waited} training steps"
+        require(waited < self.refine_every, "optimizers", expected="those of the trainer", got=got)
         return False
 
     @torch.no_grad()

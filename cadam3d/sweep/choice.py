@@ -177,11 +177,9 @@ def require_one_method(choice: Choice, rows: Sequence[Row], folder: Path) -> Non
     problem = difference(name, [score for score in scores if score is not None])
     if problem is not None:
         line = measuring_line(folder, choice.number)
-        raise UserError(f"select: {problem}. Measure all attempts in one way. Try: {line}")
+        raise UserError(f"select: {problem}. Try: {line}")
 
 
 def measuring_line(folder: Path, number: Number) -> str:
     """Return the line that measures a number of all attempts in a folder."""
-    # A run that did not measure this number may know no truth, so the line names one.
-    truth = ["truth=shapes"] if number.needs_truth else []
-    return shlex.join(["cadam3d", "eval", f"run={shown(folder)}", f"metric=[{number.metric}]", *truth])
+    return shlex.join(["cadam3d", "eval", f"run={shown(folder)}", f"metric=[{number.metric}]"])

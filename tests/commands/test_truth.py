@@ -1,10 +1,9 @@
-"""A run on any prior may name a truth, in training, in eval, in sweeps and in folders of earlier versions."""
+"""A run on any prior may name a truth, in training, in eval and in sweeps."""
 
 import shutil
 from pathlib import Path
 
 import pytest
-import yaml
 from composed import as_yaml
 from splats import make_gaussians
 
@@ -46,13 +45,6 @@ def make_run(folder: Path, *overrides: str) -> Path:
     return folder
 
 
-def without(folder: Path, *keys: str) -> None:
-    """Remove settings from the configuration of a run, as if an earlier version had written it."""
-    config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
-    kept = {key: value for key, value in config.items() if key not in keys}
-    (folder / "config.yaml").write_text(yaml.safe_dump(kept), encoding="utf-8")
-
-
 def test_a_prompt_of_another_world_is_refused_before_the_folder_exists(type_line, tmp_path):
     line = [word for word in SMALL if not word.startswith("prompt=")]
     message = type_line("train", *line, "prompt=a corgi", "truth=shapes", "steps=1").message
@@ -78,15 +70,6 @@ def test_training_and_eval_and_a_resumed_run_measure_the_same(type_line, tmp_pat
     max((folder / "checkpoints").iterdir()).unlink()
     assert type_line("train", "resume=run").code == 0
     assert quality(folder / "summary.json") == pytest.approx(measured)
-
-    # An earlier version writes neither the truth nor the metric of outlines.
-    without(folder, "truth", "metric")
-    result = type_line(*evaluate)
-    assert result.code == 0
-    assert "has no true images" in result.out
-    assert not quality(folder / "eval.json")
-    assert type_line(*evaluate, "truth=shapes").code == 0
-    assert quality(folder / "eval.json") == pytest.approx(measured)
 
 
 def test_the_exact_prior_has_the_same_psnr_against_both_truths(type_line, tmp_path):

@@ -512,7 +512,6 @@ def test_the_settings_of_default_strategy_keep_their_names_and_defaults():
         ({"refine_every": 0}, r"^refine_every: "),
         ({"reset_every": 0}, "^reset_every: "),
         ({"prune_opa": 0.5}, "^prune_opa: "),
-        ({"prune_opa": 0}, r'^prune_opa: .*Try: prune_opa=0, reset="none"$'),
     ],
 )
 def test_a_wrong_setting_is_named(settings, message):
@@ -523,7 +522,7 @@ def test_a_wrong_setting_is_named(settings, message):
 def test_a_trainer_that_resumes_without_the_state_is_warned(recwarn):
     run(Toy(CAdamStrategy(**SHORT, **YOUNG)), 1, 6)
     assert not recwarn
-    with pytest.warns(UserWarning, match="starts at step 6 without moments of earlier steps"):
+    with pytest.warns(UserWarning, match="starts at step 6 without its saved state"):
         run(Toy(CAdamStrategy(**SHORT, **YOUNG)), 6, 8)
 
 
@@ -536,7 +535,7 @@ def test_a_trainer_that_steps_other_optimizers_is_stopped_at_the_first_refinemen
         copy.step()
         if step < 3:
             toy.strategy.step_post_backward(**toy.shared, step=step)
-    with pytest.raises(UserError, match=r"optimizers: .*that the trainer steps.*none in 3 training steps"):
+    with pytest.raises(UserError, match=r"optimizers: .* in 3 training steps"):
         toy.strategy.step_post_backward(**toy.shared, step=3)
 
 

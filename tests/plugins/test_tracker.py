@@ -15,7 +15,7 @@ from cadam3d.build import component
 from cadam3d.core.errors import UserError
 from cadam3d.densifier.cadam import CAdam
 from cadam3d.plugins import CAdamTracker, reset_opacities
-from cadam3d.plugins.settings import CAdamSettings
+from cadam3d.plugins.tracker import CAdamSettings
 
 PACKAGE = Path(cadam3d.__file__).parent
 N = 12

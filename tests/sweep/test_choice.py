@@ -235,7 +235,7 @@ def test_attempts_without_the_number_are_kept_and_the_message_says_how_to_measur
     code, _, err = train("prompt=an attempt", "attempts=2", "select=psnr_min")
     assert code == 1
     assert "select: no attempt has psnr_min." in err
-    assert err.endswith(f"Try: cadam3d eval run={only_folder()} 'metric=[fidelity]' truth=shapes\n")
+    assert err.endswith(f"Try: cadam3d eval run={only_folder()} 'metric=[fidelity]'\n")
 
 
 def test_numbers_that_were_measured_in_different_ways_are_not_compared(train):
