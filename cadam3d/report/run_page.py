@@ -76,7 +76,7 @@ def write(folder: Path) -> Path:
 def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return the numbers that matter most, as far as they are known: a label and a value."""
     known = [each for each in declared(summary).values() if number(summary.get(each.name)) is not None]
-    shown = [each for each in known if each == COUNT] + preferred(known)[:1]
+    shown = [each for each in known if each.name == COUNT.name] + preferred(known)[:1]
     tiles = [(each.label, each.written(summary[each.name])) for each in shown]
     if (size := number(summary.get("asset_bytes"))) is not None:
         tiles.append((ASSET, f"{size / MIB:.2f} MiB"))

@@ -20,7 +20,6 @@ from cadam3d.report.formatting import short
 COLORS = tuple(ARMS)
 MARKERS = ("o", "s", "D", "^", "X", "P", "v", "<", ">", "p", "*", "d", "h")
 INCH = 2.9  # height of a panel
-LEAST_TEXT = 10.0  # CSS pixels; no text of a figure on a page is smaller, on whatever screen
 TICKS = 6  # at most, on a linear axis
 # The type is Any, because matplotlib types the names of its settings one by one.
 RC: Any = {
@@ -135,14 +134,13 @@ def inline(svg: str) -> str:
     """Return an SVG file as a part of an HTML page.
 
     The prolog, metadata, names of groups, fonts (the page's own are used) and decimals beyond a hundredth
-    of a point are left out, and colours become variables of the page. The variable ``--least`` holds the
-    smallest width at which the text of the drawing is legible.
+    of a point are left out, and colours become variables of the page. The variable ``--width`` holds the
+    width of the drawing.
     """
     text = svg[svg.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>", "", text, flags=re.DOTALL)
-    least = least_width(text)
-    size = r'(<svg[^>]*?) width="([\d.]+)pt" height="[^"]*"'
-    text = re.sub(size, rf'\1 style="max-width: \2pt; --least: {least:.0f}px"', text, count=1)
+    size = r'(<svg[^>]*?) width="([\d.]+pt)" height="[^"]*"'
+    text = re.sub(size, r'\1 style="--width: \2"', text, count=1)
     text = re.sub(r' xmlns(:\w+)?="[^"]*"| version="1.1"', "", text, count=3)
     text = re.sub(r'<g id="[^"]*"', "<g", text)
     text = re.sub(r" font-family: [^;\"]*;", "", text)
@@ -151,13 +149,3 @@ def inline(svg: str) -> str:
     for color, variable in VARIABLES.items():
         text = text.replace(color, f"var(--{variable}, {color})")
     return text.strip()
-
-
-def least_width(svg: str) -> float:
-    """Return the width in CSS pixels at which a drawing's smallest text has ``LEAST_TEXT``; 0 without text.
-
-    Sizes inside the drawing are in units of its view box, which has as many of them as the width has points.
-    """
-    sizes = [float(size) for size in re.findall(r"font(?:-size)?: (?:[\w ]+ )?([\d.]+)px", svg)]
-    width = re.search(r'<svg[^>]*? width="([\d.]+)pt"', svg)
-    return float(width.group(1)) * LEAST_TEXT / min(sizes) if sizes and width else 0.0

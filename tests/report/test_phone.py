@@ -10,7 +10,7 @@ import pytest
 
 from cadam3d import report
 from cadam3d.report.charts import WIDTH
-from cadam3d.report.style import inline, least_width, styled, svg_of
+from cadam3d.report.style import inline, styled, svg_of
 from cadam3d.report.sweep_page import KINDS
 
 PHONE = 375  # CSS pixels
@@ -34,19 +34,16 @@ frame.srcdoc = %s;
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_the_text_of_a_figure_is_legible_at_its_least_width(bench_results, name):
+def test_the_text_of_a_figure_is_legible_at_its_own_width(bench_results, name):
     with styled():
         figure = KINDS[name].draw(bench_results)
         if figure is None:
             pytest.skip("the results have no such figure")
         svg = svg_of(figure, name, dpi=100)
     sizes = [float(size) for size in re.findall(r"font(?:-size)?: (?:[a-z0-9 ]+ )?([\d.]+)px", svg)]
-    [width] = map(float, re.findall(r'viewBox="0 0 ([\d.]+)', svg))
-    assert min(sizes) * least_width(svg) / width >= LEGIBLE
-    # Such a width needs no scrolling on a computer, where a point is 4/3 of a pixel.
-    assert least_width(svg) <= width * 4 / 3 + 1
-    assert f"--least: {least_width(svg):.0f}px" in inline(svg)
-    assert "min-width: var(--least)" in CSS
+    # One unit of the drawing is one point, which is 4/3 of a pixel.
+    assert min(sizes) * 4 / 3 >= LEGIBLE
+    assert 'style="--width: ' in inline(svg)
 
 
 def test_the_text_of_a_chart_is_legible_on_a_phone():
