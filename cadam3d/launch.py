@@ -65,12 +65,10 @@ def prepare(command: str, words: Sequence[str]) -> tuple[DictConfig, Call]:
     """
     with explaining(command, words):
         line = read_line(command, words)
-        shell = f"in a shell: {shlex.join(['cadam3d', command, *words])}"
-        is_single = command != "sweep" and not line.wants_page
-        require(is_single, command, expected="a single run without a page", got=line.words, example=shell)
-        cfg = _composed(line)
-        attempts = cfg.get("attempts", 1)
-        require(attempts == 1, "attempts", expected="1 in Python", got=attempts, example=shell)
+        cfg = None if command == "sweep" or line.wants_page else _composed(line)
+        if cfg is None or cfg.get("attempts", 1) > 1:
+            shell = f"in a shell: {shlex.join(['cadam3d', command, *words])}"
+            raise fail(command, expected="a single run without a page", got=line.words, example=shell)
         return cfg, _call(line, cfg)
 
 

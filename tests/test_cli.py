@@ -22,6 +22,7 @@ from cadam3d import cli
 from cadam3d.commands.beginning import begun
 from cadam3d.core.errors import UserError
 from cadam3d.io.occupied import occupied
+from cadam3d.io.records import read_config
 from cadam3d.io.run_folder import OVERRIDES, claim
 from cadam3d.launch import launch
 from cadam3d.settings import compose as settings
@@ -195,7 +196,7 @@ def test_a_prompt_is_unchanged_in_the_command_and_in_the_config_of_its_run(promp
     assert cfg.prompt == prompt
     path = tmp_path / "config.yaml"
     path.write_text(OmegaConf.to_yaml(cfg, resolve=True), encoding="utf-8")
-    assert settings.load_config(path).prompt == prompt
+    assert read_config(path)["prompt"] == prompt
 
 
 def test_quoting_is_undone_by_hydra_and_omegaconf_for_any_text():
@@ -420,7 +421,7 @@ def test_resuming_from_a_folder_without_a_run_is_refused(place, type_line, jobs)
 
 def test_resume_stays_in_its_folder_and_out_of_sweeps(run_folder, type_line):
     assert (
-        "expected the folder of the resumed run"
+        ", which is resumed"
         in type_line("train", f"resume={run_folder}", "hydra.run.dir=other").message
     )
     assert "not a sweep" in type_line("sweep", f"resume={run_folder}", "seed=0,1").message

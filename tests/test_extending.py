@@ -66,10 +66,11 @@ def run_line(place: Path, line: str) -> str:
 def energy(place, monkeypatch):
     """Build the densifier of the page with the values of its YAML file."""
     monkeypatch.syspath_prepend(str(place))
-    from cadam3d.build import component
-    from cadam3d.settings.compose import load_config
+    from omegaconf import OmegaConf
 
-    yield component(load_config(place / "myconfigs/densifier/energy.yaml"))
+    from cadam3d.build import component
+
+    yield component(OmegaConf.load(place / "myconfigs/densifier/energy.yaml"))
     for name in [name for name in sys.modules if name.partition(".")[0] == "mypackage"]:
         del sys.modules[name]
 

@@ -16,8 +16,9 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.checkpoint import DamagedCheckpointError, latest_checkpoint, load_checkpoint
+from cadam3d.io.records import read_config
 from cadam3d.io.run_folder import CHECKPOINTS, CONFIG, checkpoint_step
-from cadam3d.settings.compose import flatten, load_config
+from cadam3d.settings.compose import flatten
 from cadam3d.settings.line import NOT_OF_A_RUN
 from cadam3d.state import PayloadError, TrainState
 from cadam3d.trainer import Trainer
@@ -79,7 +80,7 @@ def note_changes(cfg: DictConfig, folder: Path) -> None:
     """Print the settings that have changed, because the run then differs from an uninterrupted one."""
     if not (folder / CONFIG).is_file():
         return
-    before = dict(flatten(OmegaConf.to_container(load_config(folder / CONFIG), resolve=True)))
+    before = dict(flatten(read_config(folder / CONFIG)))
     now = dict(flatten(OmegaConf.to_container(cfg, resolve=True)))
     for key in sorted(before.keys() | now.keys()):
         if key not in NOT_OF_A_RUN and before.get(key) != now.get(key):

@@ -22,7 +22,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
-from cadam3d.io.reading import read_yaml
 from cadam3d.settings.options import config_dir
 
 # Hydra behaves like this version even if a newer one is installed.
@@ -118,18 +117,6 @@ def run_hydra(
     finally:
         sys.argv = arguments_before
         os.environ["HYDRA_FULL_ERROR"] = switch_before or "0"
-
-
-def load_config(path: Path) -> DictConfig:
-    """Return the resolved ``config.yaml`` of a run. Text that looks like an interpolation stays text.
-
-    Raises ``UserError`` if the file cannot be read. What it names must not be built without the checks of
-    ``cadam3d.settings.trust``.
-    """
-    content = read_yaml(path)
-    if not isinstance(content, dict):
-        raise UserError(f"{path}: expected the settings of a run, got other data. Try: another run")
-    return DictConfig(escaped(content))
 
 
 def flatten(node: object, prefix: str = "", *, with_nodes: bool = False) -> Iterator[tuple[str, object]]:

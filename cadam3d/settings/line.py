@@ -27,10 +27,8 @@ PATH_KEYS = (
 DRY_RUN = "dry_run"
 LAUNCHER_KEY = re.compile(r"launcher($|\.)|hydra[./]launcher($|\.)")
 OF_SWEEPS = re.compile(rf"{DRY_RUN}$|{LAUNCHER_KEY.pattern}")
-# Settings of a line that trains several seeds, which its runs do not have.
-OF_ATTEMPTS = ("attempts", "select")
 # Settings of a line that do not change what a run computes, so they may differ when it is continued.
-NOT_OF_A_RUN = ("resume", "trust", *OF_ATTEMPTS)
+NOT_OF_A_RUN = ("resume", "trust", "attempts", "select")
 # Keys whose value may be a list of paths or of texts, such as run=[A,B].
 LIST_KEYS = ("run", "runs", "labels", "arms", "answers")
 QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""", re.DOTALL)
@@ -135,18 +133,16 @@ def resumed(
     text = text_of(given["resume"]) if "resume" in given else "null"
     if text in ("null", ""):
         return list(overrides)
-    word = setting_word("resume", text)
-    require(not is_sweep, "resume", expected="one run, not a sweep", got=text, example=word)
+    require(not is_sweep, "resume", expected="one run, not a sweep", got=text)
     path = typed_path(text)
     holders = [place for place in (path, *path.parents) if has_file(place, OVERRIDES)]
     is_run = holders and os.path.lexists(path) and (path == holders[0] or not path.is_dir())
     expected = f"the folder of a run (it contains {OVERRIDES})"
     require(bool(is_run), "resume", expected=expected, got=text, example=f"resume={LATEST}")
     folder = holders[0]
-    stays = RUN_FOLDER not in given or typed_path(text_of(given[RUN_FOLDER])) == folder
-    require(
-        stays, RUN_FOLDER, expected="the folder of the resumed run", got=given.get(RUN_FOLDER), example=word
-    )
+    place = text_of(given[RUN_FOLDER]) if RUN_FOLDER in given else text
+    expected, example = f"{folder}, which is resumed", setting_word("resume", text)
+    require(typed_path(place) in (folder, path), RUN_FOLDER, expected=expected, got=place, example=example)
     is_judged = not is_trusted(overrides)
     require_contained(folder, retry if is_judged else None)
     before = read_overrides(folder / OVERRIDES)

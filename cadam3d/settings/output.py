@@ -30,9 +30,7 @@ def exporting(overrides: Sequence[str], folders: Sequence[Path] = ()) -> list[st
     named = {key.split(".")[1] for key in given if key.startswith("exporter.")}
     # A setting of an exporter, such as exporter.glb.up=-y, is a deliberate change of what for= chooses.
     if "for" in given and "exporter" in given:
-        raise fail(
-            "exporter", expected="for= alone, which chooses it", got=given["exporter"], example=given["for"]
-        )
+        raise fail("exporter", expected="for= alone", got=given["exporter"], example=given["for"])
     if "for" in given or not names_file(name):
         is_comparison = is_list(given.get("run", "")) and "exporter" not in given and named <= set(COMPARING)
         return [*overrides, *([f"exporter=[{','.join(COMPARING)}]"] if is_comparison else [])]
@@ -41,9 +39,8 @@ def exporting(overrides: Sequence[str], folders: Sequence[Path] = ()) -> list[st
     suffix = suffix_of(name, by_suffix)
     if suffix not in by_suffix and not named and "exporter" not in given:
         expected = f"a file with suffix {'|'.join(by_suffix)}, or a folder"
-        free = numbered(Path(name), first=1)
-        example = INSTEAD.get(suffix) or setting_word("output", f"{free}/")
-        raise fail("output", expected=expected, got=name, example=example)
+        free = setting_word("output", f"{numbered(Path(name), first=1)}/")
+        raise fail("output", expected=expected, got=name, example=INSTEAD.get(suffix, free))
     if "exporter" in given:
         value = value_of(given["exporter"])
         named |= set(map(str, value if isinstance(value, list) else [value]))

@@ -25,8 +25,7 @@ from cadam3d.io.declarations import read_declarations
 from cadam3d.io.jsonl import truncate_after
 from cadam3d.io.ply import holds_gaussians, read_ply
 from cadam3d.io.reading import read_text
-from cadam3d.io.records import read_histograms, read_metrics, read_summary
-from cadam3d.settings.compose import load_config
+from cadam3d.io.records import read_config, read_histograms, read_metrics, read_summary
 from cadam3d.settings.trust import read_overrides
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
@@ -112,7 +111,7 @@ def finished(tmp_path_factory) -> Path:
 READERS: dict[str, Callable[[Path], object]] = {
     "asset.ply": lambda run: holds_gaussians(run / "asset.ply") and read_ply(run / "asset.ply"),
     "charts.json": read_declarations,
-    "config.yaml": lambda run: load_config(run / "config.yaml"),
+    "config.yaml": lambda run: read_config(run / "config.yaml"),
     "metrics.jsonl": lambda run: (read_metrics(run), truncate_after(run / "metrics.jsonl", 2)),
     "summary.json": read_summary,
     "report.html": lambda run: read_text(run / "report.html"),

@@ -277,7 +277,7 @@ def test_a_target_chooses_an_exporter_and_its_axes(target, run_folder, type_line
 
 def test_a_target_and_an_exporter_are_refused_but_a_setting_of_the_exporter_wins(run_folder, type_line):
     message = type_line("export", f"run={run_folder}", "for=spark", "exporter=[ply]").message
-    expected = "exporter: expected for= alone, which chooses it, got 'exporter=[ply]'. Try: for=spark"
+    expected = "exporter: expected for= alone, got 'exporter=[ply]'. Try: for=spark"
     assert message == expected
     assert type_line("export", f"run={run_folder}", "for=spark", "exporter.ply.up=-y").code == 0
     [entry] = files_in(run_folder / "exports/asset.json").values()
