@@ -420,10 +420,7 @@ def test_resuming_from_a_folder_without_a_run_is_refused(place, type_line, jobs)
 
 
 def test_resume_stays_in_its_folder_and_out_of_sweeps(run_folder, type_line):
-    assert (
-        ", which is resumed"
-        in type_line("train", f"resume={run_folder}", "hydra.run.dir=other").message
-    )
+    assert ", which is resumed" in type_line("train", f"resume={run_folder}", "hydra.run.dir=other").message
     assert "not a sweep" in type_line("sweep", f"resume={run_folder}", "seed=0,1").message
 
 
