@@ -15,7 +15,7 @@ from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 from cadam3d.io.image import step_picture
 from cadam3d.io.run_folder import PREVIEWS
-from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainState
+from cadam3d.state import RefineReport, RunContext, StepReport, TrainState
 
 
 @dataclass(kw_only=True)
@@ -24,16 +24,15 @@ class Tracking(Callback):
 
     The numbers have the names of ``metrics.jsonl`` and ``summary.json``, with one of the prefixes ``train/``,
     ``refine/`` and ``result/``. No run depends on a tracker: if one raises any exception, it is switched off
-    with a warning. Nothing here draws a random number or changes the run.
+    with a warning. A preview is recorded if the callback that draws it comes earlier in the list. Nothing
+    here draws a random number or changes the run.
     """
 
     package: ClassVar[str]  # that pip installs; also the name of the callback and of the extra
 
     every: Count  # steps
     _works: bool = field(default=True, init=False, repr=False)
-    # The last step that was reported, if any, and its numbers. They are passed on one step later. By then the
-    # preview of the step has been drawn, even if the callback that draws it comes later in the list.
-    _step: int | None = field(default=None, init=False, repr=False)
+    # The numbers of a refinement, which are recorded with its step.
     _numbers: dict[str, float] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -62,28 +61,26 @@ class Tracking(Callback):
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Open the tracker at the current step."""
-        self._works, self._step, self._numbers = True, None, {}
+        self._works, self._numbers = True, {}
         self._attempt(lambda: self.open(context, state.step))
 
     def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
         """Keep the counts and the statistics of a refinement for :meth:`on_step` of the same step."""
-        self._pass_on(context, report.step)
         counts = {
             name: each for name, each in vars(report).items() if isinstance(each, int) and name != "step"
         }
         numbers = counts | report.statistics
-        self._numbers |= {f"refine/{name}": number for name, number in numbers.items()}
+        self._numbers = {f"refine/{name}": number for name, number in numbers.items()}
 
     def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
-        """Keep the numbers of a multiple of ``every``, and of the first and the last step."""
-        self._pass_on(context, report.step)
+        """Record the numbers of a multiple of ``every``, and of the first and the last step."""
+        numbers, self._numbers = self._numbers, {}
         if report.step % self.every == 0 or report.step in (1, context.total_steps):
-            numbers = step_numbers(state, report)
-            self._numbers |= {f"train/{name}": number for name, number in numbers.items()}
-
-    def on_end(self, context: RunContext, state: TrainState, outcome: Outcome) -> None:
-        """Record the last step."""
-        self._pass_on(context, None)
+            numbers |= {f"train/{name}": number for name, number in step_numbers(state, report).items()}
+        picture = step_picture(context.folder / PREVIEWS, report.step)
+        preview = picture if picture.is_file() else None
+        if numbers or preview is not None:
+            self._attempt(lambda: self.record(report.step, numbers, preview))
 
     def on_result(self, context: RunContext, summary: Mapping[str, Any]) -> None:
         """Record the numbers of the summary and close the tracker."""
@@ -92,22 +89,8 @@ class Tracking(Callback):
         self._attempt(lambda: self.close(is_complete=True))
 
     def on_abort(self, context: RunContext) -> None:
-        """Record the last step and close the tracker."""
-        self._pass_on(context, None)
+        """Close the tracker."""
         self._attempt(lambda: self.close(is_complete=False))
-
-    def _pass_on(self, context: RunContext, next_step: int | None) -> None:
-        """Record the step that was reported before ``next_step``, which is None after the last one."""
-        step, numbers = self._step, self._numbers
-        if step == next_step:
-            return
-        self._step, self._numbers = next_step, {}
-        if step is None:
-            return
-        picture = step_picture(context.folder / PREVIEWS, step)
-        preview = picture if picture.is_file() else None
-        if numbers or preview is not None:
-            self._attempt(lambda: self.record(step, numbers, preview))
 
     def _attempt(self, action: Callable[[], None]) -> None:
         if not self._works:

@@ -119,7 +119,7 @@ def _write(path: Path, gaussians: Gaussians, *, up: str, kind: str) -> None:
     sh = local.sh.clamp(-LARGEST_SH, LARGEST_SH)
     rest = sh[:, 1:]
     if kind == "ksplat":
-        rest = _by_bands(sh[:, 1 : (KSPLAT_SH_DEGREE + 1) ** 2])
+        rest = _reordered(sh[:, 1 : (KSPLAT_SH_DEGREE + 1) ** 2], is_read=False)
     cloud = {
         "numPoints": len(local),
         "positions": _bytes(local.means),
@@ -161,7 +161,9 @@ def read_forged(path: Path, kind: str, *, up: str = "-y") -> Gaussians:
         except UserError as error:
             raise UserError(str(error).replace(str(copy), str(path))) from error
     if kind == "ksplat":
-        local = replace(local, sh=torch.cat([local.sh[:, :1], _from_bands(local.sh[:, 1:])], dim=1))
+        local = replace(
+            local, sh=torch.cat([local.sh[:, :1], _reordered(local.sh[:, 1:], is_read=True)], dim=1)
+        )
     return file_to_world(local, up)
 
 
@@ -201,28 +203,19 @@ def _forged(
     return b"", plain or f"it ended with {process.returncode}"
 
 
-def _by_bands(rest: Float[Tensor, "n r 3"]) -> Float[Tensor, "n r 3"]:
+def _reordered(rest: Float[Tensor, "n r 3"], *, is_read: bool) -> Float[Tensor, "n r 3"]:
     """Return coefficients of degree 1 and higher, arranged so that gaussforge writes a correct ksplat file.
 
     The format has one block for each degree, and in it all of red, then green, then blue. gaussforge writes
-    a single block: all of red, then green, then blue.
+    a single block: all of red, then green, then blue. With ``is_read``, this is undone.
     """
-    bands, first = [], 0
-    while first < rest.shape[1]:
-        size = 2 * len(bands) + 3
-        bands.append(rest[:, first : first + size].mT.flatten(1))
-        first += size
-    return torch.cat([rest[:, :0, 0], *bands], dim=1).reshape(len(rest), 3, rest.shape[1]).mT
-
-
-def _from_bands(rest: Float[Tensor, "n r 3"]) -> Float[Tensor, "n r 3"]:
-    """Return the coefficients of a correct ksplat file that gaussforge has read, the inverse of the above."""
-    flat, bands = rest.mT.flatten(1), []
-    while sum(band.shape[1] for band in bands) < rest.shape[1]:
-        size = 2 * len(bands) + 3
-        first = 3 * sum(band.shape[1] for band in bands)
-        bands.append(flat[:, first : first + 3 * size].reshape(-1, 3, size).mT)
-    return torch.cat(bands, dim=1) if bands else rest
+    count = rest.shape[1]
+    bands = [range(degree**2 - 1, (degree + 1) ** 2 - 1) for degree in range(1, round((count + 1) ** 0.5))]
+    order = torch.tensor(
+        [channel * count + k for band in bands for channel in range(3) for k in band], dtype=torch.int64
+    )
+    flat = rest.mT.flatten(1)[:, order.argsort() if is_read else order]
+    return flat.reshape(len(rest), 3, count).mT
 
 
 def _bytes(tensor: Tensor) -> bytes:

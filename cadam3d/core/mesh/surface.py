@@ -315,13 +315,10 @@ def compacted(
 
 def is_watertight(faces: Int[np.ndarray, "f 3"]) -> bool:
     """Return whether each edge belongs to two triangles, which run through it in opposite directions."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    if len(edges) == 0 or bool((edges[:, 0] == edges[:, 1]).any()):
-        return False
-    size = int(faces.max()) + 1
-    there = np.sort(edges[:, 0] * size + edges[:, 1])
-    back = np.sort(edges[:, 1] * size + edges[:, 0])
-    return bool((np.diff(there) > 0).all() and (there == back).all())
+    from trimesh.geometry import faces_to_edges  # both are slow to import
+    from trimesh.graph import is_watertight as has_closed_edges
+
+    return all(map(bool, has_closed_edges(faces_to_edges(faces))))
 
 
 def parts_of(count: int, faces: Int[np.ndarray, "f corners"]) -> Int[np.ndarray, "count"]:
