@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, fields
 
+from cadam3d.core.errors import UserError
 from cadam3d.prior.exact import ExactEmbedding, ExactPrior, ExactScene
 from cadam3d.prior.objects.catalog import read_catalog
 from cadam3d.prior.objects.prior import ObjectsPrior
@@ -28,6 +29,21 @@ class WorldPrior(ExactPrior):
         return self.chosen(prompt).scene(prompt, key)
 
     def chosen(self, prompt: str) -> ExactPrior:
-        """Return the prior of the world that knows a prompt: the objects if they do, and else the shapes."""
-        kind = ObjectsPrior if read_catalog(self.folder).matching(prompt) else ShapesPrior
+        """Return the prior of the world that has a prompt: the objects if they do, and else the shapes.
+
+        Raises ``UserError`` if neither does.
+        """
+        catalog = read_catalog(self.folder)
+        if catalog.matching(prompt):
+            return self._as(ObjectsPrior)
+        shapes = self._as(ShapesPrior)
+        try:
+            shapes.scene(prompt)
+        except UserError as error:
+            if near := catalog.nearest(prompt):
+                raise UserError(f'{error} Or the object alone: prompt="a {near}"') from error
+            raise
+        return shapes
+
+    def _as(self, kind: type[ExactPrior]) -> ExactPrior:
         return kind(**{field.name: getattr(self, field.name) for field in fields(kind)})

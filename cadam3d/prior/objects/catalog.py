@@ -16,6 +16,7 @@ from cadam3d.io.reading import read_text
 from cadam3d.io.run_folder import expanded, has_file
 from cadam3d.prior.exact import Census, stored_census
 from cadam3d.prior.objects.scene import MeshScene, read_object
+from cadam3d.prior.shapes.grammar import SIMILAR
 from cadam3d.prior.shapes.words import ARTICLES, FILLERS, typed_words
 
 WORLD = Path(__file__).parent / "world"  # the objects that come with cadam3d
@@ -65,9 +66,11 @@ class Catalog:
         return named or [entry for entry in self.entries if asked and entry.words.issuperset(asked)]
 
     def nearest(self, prompt: str) -> str:
-        """Return the name of an object that is spelled nearly like the prompt, or else of any object."""
-        asked = " ".join(word for word in _words(prompt) if word not in ARTICLES | FILLERS)
-        return nearest(asked, [entry.name for entry in self.entries]) or self.entries[0].name
+        """Return the name of an object that is spelled nearly like the prompt or a word of it; "" if none."""
+        asked = [word for word in _words(prompt) if word not in ARTICLES | FILLERS]
+        names = [entry.name for entry in self.entries]
+        near = (nearest(text, names, least=SIMILAR) for text in (" ".join(asked), *asked))
+        return next(filter(None, near), "")
 
     def scene(self, entries: Sequence[Entry]) -> MeshScene:
         """Return the scene whose modes are these objects. Raises ``UserError`` if one cannot be read."""

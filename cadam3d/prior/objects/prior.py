@@ -33,7 +33,8 @@ class ObjectsPrior(ExactPrior):
         catalog, found = read_catalog(self.folder), self.named(prompt)
         if not found:
             known = "the name or a tag of an object" + (f" in {self.folder}" if self.folder else "")
-            raise fail(key, expected=known, got=prompt, example=f'{key}="a {catalog.nearest(prompt)}"')
+            name = catalog.nearest(prompt) or catalog.entries[0].name
+            raise fail(key, expected=known, got=prompt, example=f'{key}="a {name}"')
         return catalog.scene(found)
 
     def named(self, prompt: str) -> list[Entry]:
@@ -46,8 +47,9 @@ class MeshPrior(ExactPrior):
     """A Gaussian over images of one mesh, whatever the prompt says."""
 
     path: str
+    folder: str | None  # of the objects that the empty prompt allows; None: those that come with cadam3d
     up: Annotated[str, one_of(UPS)]  # the up axis of the file
 
     def scene(self, prompt: str, key: str = "prompt") -> MeshScene:
         """Return the mesh. Raises ``UserError`` if it cannot be read, or if it has no triangles."""
-        return MeshScene([read_object(self.path, "prior.path", self.up)], read_catalog(None).census)
+        return MeshScene([read_object(self.path, "prior.path", self.up)], read_catalog(self.folder).census)
