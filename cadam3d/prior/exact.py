@@ -39,7 +39,7 @@ Samples = Annotated[int, whole(low=1, high=8)]  # points per pixel along each ax
 
 
 class ExactScene(ABC):
-    """What a prompt shows, with ``m`` modes; more than one if the prompt leaves something open."""
+    """The content of a prompt, with ``m`` modes; more than one if the prompt leaves something open."""
 
     log_weights: Float[Tensor, "m"]  # of the modes; the weights sum to one
 
