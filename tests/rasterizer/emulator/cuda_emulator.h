@@ -11,13 +11,11 @@
 // use a number without a barrier between them are reported however they were scheduled.
 #pragma once
 
-#include <setjmp.h>
 #include <ucontext.h>
 
 #include <cmath>
 #include <cstdint>
 #include <cstring>
-#include <deque>
 #include <memory>
 #include <stdexcept>
 #include <string>
@@ -94,6 +92,7 @@ constexpr size_t STACK = 64 << 10;
 #endif
 // Fibers are used again, by every so many blocks. Unordered blocks with the same fibers would be ordered.
 constexpr unsigned SETS = 4;
+constexpr int MOST_THREADS = 1024;  // of a block, on every GPU
 
 struct Failure : std::runtime_error {
   using std::runtime_error::runtime_error;
@@ -108,11 +107,11 @@ struct Meeting {
 };
 
 struct Fiber {
-  ucontext_t start;
-  jmp_buf place;
-  void* identity = order::create();  // the thread of ThreadSanitizer
-  std::unique_ptr<char[]> stack{new char[STACK]};
-  bool has_started = false, has_ended = true;
+  ucontext_t place;
+  void* top = nullptr;  // of the stack, while another one runs
+  void* identity = nullptr;  // the thread of ThreadSanitizer
+  std::unique_ptr<char[]> stack;
+  bool has_ended = true;
   const Meeting* waits_at = nullptr;
   unsigned waits_since = 0;
   bool can_run() const { return !has_ended && (!waits_at || waits_at->generation != waits_since); }
@@ -128,18 +127,19 @@ struct Random {
     state ^= state << 17;
     return unsigned(state >> 32);
   }
+  unsigned below(unsigned limit) { return unsigned(uint64_t((*this)()) * limit >> 32); }
 };
 
 struct Machine {
   Random random;
   bool is_shuffled = false;
-  std::deque<Fiber> sets[SETS];  // a context must not be moved
-  std::deque<Fiber>* fibers = sets;
+  std::unique_ptr<Fiber[]> sets[SETS];
+  Fiber* fibers = nullptr;  // of this block
   std::vector<Meeting> warps;
   Meeting block;
   int running = 0;
-  jmp_buf scheduler;
-  ucontext_t outside;  // the scheduler, as ThreadSanitizer follows it
+  ucontext_t outside;  // the scheduler
+  void* top = nullptr;
   void* identity = nullptr;
   char launched, ended;  // what they order is known by their addresses
   std::string trouble;
@@ -147,27 +147,42 @@ struct Machine {
   void* argument = nullptr;
 };
 inline Machine machine;
-inline Fiber& running_fiber() { return (*machine.fibers)[size_t(machine.running)]; }
+inline Fiber& running_fiber() { return machine.fibers[machine.running]; }
 
-#if defined(__SANITIZE_THREAD__)
-// ThreadSanitizer intercepts setjmp, and does not let it leave a stack.
-inline void yield() {
-  order::switch_to(machine.identity);
-  swapcontext(&running_fiber().start, &machine.outside);
-}
-inline void enter(Fiber& fiber) {
-  order::switch_to(fiber.identity);
-  swapcontext(&machine.outside, &fiber.start);
+inline void fiber_main();
+
+#if defined(__x86_64__) && !defined(__SANITIZE_THREAD__)
+// Saves the registers that a function must keep and the top of this stack, and continues on another stack.
+// swapcontext calls the system, and AddressSanitizer does so before each longjmp.
+extern "C" void emulator_switch(void** from, void* to);
+asm(".text\n.globl emulator_switch\nemulator_switch:\n"
+    "push %rbp\npush %rbx\npush %r12\npush %r13\npush %r14\npush %r15\n"
+    "mov %rsp, (%rdi)\nmov %rsi, %rsp\n"
+    "pop %r15\npop %r14\npop %r13\npop %r12\npop %rbx\npop %rbp\nret\n");
+inline void yield() { emulator_switch(&running_fiber().top, machine.top); }
+inline void enter(Fiber& fiber) { emulator_switch(&machine.top, fiber.top); }
+inline void prepare(Fiber& fiber) {
+  const uintptr_t end = reinterpret_cast<uintptr_t>(fiber.stack.get() + STACK) / 16 * 16;
+  void** const slots = reinterpret_cast<void**>(end) - 8;  // six registers, the address to return to, a gap
+  for (int i = 0; i < 8; ++i) slots[i] = nullptr;
+  slots[6] = reinterpret_cast<void*>(fiber_main);
+  fiber.top = slots;
 }
 #else
 inline void yield() {
-  if (_setjmp(running_fiber().place) == 0) _longjmp(machine.scheduler, 1);
+  order::switch_to(machine.identity);
+  swapcontext(&running_fiber().place, &machine.outside);
 }
 inline void enter(Fiber& fiber) {
-  if (_setjmp(machine.scheduler) != 0) return;
-  if (fiber.has_started) _longjmp(fiber.place, 1);
-  fiber.has_started = true;
-  setcontext(&fiber.start);
+  order::switch_to(fiber.identity);
+  swapcontext(&machine.outside, &fiber.place);
+}
+inline void prepare(Fiber& fiber) {
+  getcontext(&fiber.place);
+  fiber.place.uc_stack.ss_sp = fiber.stack.get();
+  fiber.place.uc_stack.ss_size = STACK;
+  fiber.place.uc_link = nullptr;
+  makecontext(&fiber.place, fiber_main, 0);
 }
 #endif
 
@@ -224,30 +239,28 @@ inline void resume(int index) {
 
 // The fibers that stand somewhere in a kernel cannot be used again.
 [[noreturn]] inline void give_up(const std::string& trouble) {
-  machine.fibers->clear();
+  for (auto& set : machine.sets)
+    if (set.get() == machine.fibers) set.reset();
   throw Failure(trouble);
 }
 
 inline void run_block(int threads, unsigned set) {
-  machine.fibers = &machine.sets[set];
+  if (!machine.sets[set]) machine.sets[set].reset(new Fiber[MOST_THREADS]);
+  Fiber* const fibers = machine.fibers = machine.sets[set].get();
   machine.warps.assign(size_t((threads + WARP - 1) / WARP), Meeting());
   machine.block = Meeting();
   machine.block.members = threads;
-  std::vector<int> order;
+  int order[MOST_THREADS];
   for (int i = 0; i < threads; ++i) {
-    if (machine.fibers->size() <= size_t(i)) {
-      Fiber& fiber = machine.fibers->emplace_back();
-      getcontext(&fiber.start);
-      fiber.start.uc_stack.ss_sp = fiber.stack.get();
-      fiber.start.uc_stack.ss_size = STACK;
-      fiber.start.uc_link = nullptr;
-      makecontext(&fiber.start, fiber_main, 0);
+    if (!fibers[i].stack) {
+      fibers[i].stack.reset(new char[STACK]);
+      fibers[i].identity = order::create();
+      prepare(fibers[i]);
     }
-    Fiber& fiber = (*machine.fibers)[size_t(i)];
-    fiber.has_ended = false;
-    fiber.waits_at = nullptr;
+    fibers[i].has_ended = false;
+    fibers[i].waits_at = nullptr;
     ++machine.warps[size_t(i / WARP)].members;
-    order.push_back(i);
+    order[i] = i;
   }
   // Now and then one warp stands still, in most cases until all others wait for it. Without that, all threads
   // would take about as many steps, and a fast warp could never overtake a slow one.
@@ -256,13 +269,18 @@ inline void run_block(int threads, unsigned set) {
     if (machine.is_shuffled && machine.random() % (stalled < 0 ? 16 : 256) == 0)
       stalled = stalled < 0 ? int(machine.random() % machine.warps.size()) : -1;
     if (machine.is_shuffled)
-      for (size_t i = order.size() - 1; i > 0; --i) std::swap(order[i], order[machine.random() % (i + 1)]);
+      for (int i = threads - 1; i > 0; --i) {
+        const unsigned j = machine.random.below(unsigned(i) + 1);
+        const int moved = order[i];
+        order[i] = order[j], order[j] = moved;
+      }
     bool has_run = false;
-    for (const int i : order) {
-      if (i / WARP == stalled || !(*machine.fibers)[size_t(i)].can_run()) continue;
+    for (int place = 0; place < threads; ++place) {
+      const int i = order[place];
+      if (i / WARP == stalled || !fibers[i].can_run()) continue;
       has_run = true;
       resume(i);
-      alive -= (*machine.fibers)[size_t(i)].has_ended;
+      alive -= fibers[i].has_ended;
       if (!machine.trouble.empty()) give_up(machine.trouble);
     }
     if (!has_run && stalled < 0) give_up("deadlock: some threads wait at a barrier that others never reach");
