@@ -23,7 +23,7 @@ from cadam3d.sweep.process import run_job
 
 pytestmark = pytest.mark.slow
 
-SMALL = ["prompt=a red cube", "experiment=smoke", "rasterizer=reference"]
+SMALL = ["prompt=a red cube", "experiment=smoke"]
 # The pictures are tested once; they take more time than the training.
 BARE = [*SMALL, "exporter=[ply]"]
 IMPORTED = "imported.txt"  # lists the modules that a training has loaded
@@ -72,7 +72,7 @@ def wait_for(path: Path, process: subprocess.Popen) -> None:
     while not path.exists():
         assert process.poll() is None, f"ended before {path.name} was written: {process.communicate()}"
         assert time.monotonic() < deadline, f"{path.name} was not written"
-        time.sleep(0.02)
+        time.sleep(0.005)
 
 
 def without_time(lines: list[dict]) -> list[dict]:
@@ -114,25 +114,6 @@ def test_eval_measures_what_train_measured(finished, type_in):
         assert evaluation[key] == pytest.approx(summary[key], rel=1e-6)
 
 
-def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(finished, tmp_path, type_in):
-    run_folder = tmp_path / "run"
-    words = [*BARE, f"hydra.run.dir={run_folder}", "callback.checkpoint.every=7", "callback.metrics.every=1"]
-    process = start(tmp_path, "train", *words)
-    wait_for(run_folder / "checkpoints" / "step_0000014.pt", process)
-    process.kill()  # SIGKILL: the process cannot clean up
-    process.communicate()
-    assert not (run_folder / "summary.json").exists()
-
-    type_in(tmp_path, "train", f"resume={run_folder}")
-    whole = finished / "outputs" / "latest"
-    assert (run_folder / "asset.ply").read_bytes() == (whole / "asset.ply").read_bytes()
-    lines = read_jsonl(run_folder / "metrics.jsonl")
-    steps = [line["step"] for line in lines if line["kind"] == "step"]
-    assert steps == list(range(1, 41))
-    logged = [line for line in lines if line["kind"] == "refine" or line["step"] in (1, *range(0, 41, 5))]
-    assert without_time(logged) == without_time(read_jsonl(whole / "metrics.jsonl"))
-
-
 def test_a_run_is_refused_in_a_folder_that_holds_another_one(finished, type_in):
     latest = (finished / "outputs" / "latest").resolve()
     before = (latest / "asset.ply").read_bytes()
@@ -156,7 +137,8 @@ def test_a_run_starts_without_slow_imports(finished):
 @pytest.mark.parametrize("number", ENDING)
 def test_a_signal_saves_everything_and_prints_how_to_continue(tmp_path, number):
     run_folder = tmp_path / "run"
-    process = start(tmp_path, "train", *BARE, f"hydra.run.dir={run_folder}", "callback.checkpoint.every=5")
+    words = [*BARE, "steps=4000", f"hydra.run.dir={run_folder}", "callback.checkpoint.every=5"]
+    process = start(tmp_path, "train", *words)
     wait_for(run_folder / "checkpoints" / "step_0000005.pt", process)
     process.send_signal(number)
     out, err = process.communicate(timeout=SECONDS)
@@ -164,7 +146,7 @@ def test_a_signal_saves_everything_and_prints_how_to_continue(tmp_path, number):
     assert "Traceback" not in err
     summary = json.loads((run_folder / "summary.json").read_text())
     assert summary["outcome"] == "interrupted"
-    assert 5 <= summary["steps"] < 40
+    assert 5 <= summary["steps"] < 4000
     assert len(read_ply(run_folder / "asset.ply")) == summary["num_gaussians"]
     assert f"cadam3d train resume={run_folder.name}" in out
 
@@ -196,15 +178,16 @@ def test_a_dry_run_on_the_tiny_prior_prints_that_its_result_is_meaningless(tmp_p
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the process of a job in /proc")
-def test_a_sweep_continues_after_a_killed_job_and_the_same_line_completes_it(
+def test_a_sweep_continues_after_a_killed_job_and_the_same_line_completes_it_to_the_byte(
     finished, tmp_path, type_in, request
 ):
-    words = [*BARE, "densifier=cadam,none", "callback.checkpoint.every=7", "hydra.sweep.dir=table"]
+    often = ["callback.checkpoint.every=7", "callback.metrics.every=1"]
+    words = [*BARE, "densifier=cadam,none", *often, "hydra.sweep.dir=table"]
     table = tmp_path / "table"
     process = start(tmp_path, "sweep", *words)
     wait_for(table / "jobs.json", process)
     jobs = [table / job["name"] for job in json.loads((table / "jobs.json").read_text())["jobs"]]
-    wait_for(jobs[0] / "checkpoints" / "step_0000014.pt", process)
+    wait_for(jobs[0] / "checkpoints" / "step_0000007.pt", process)
     [child] = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     os.kill(int(child), signal.SIGKILL)
     _, err = process.communicate(timeout=SECONDS)
@@ -220,6 +203,10 @@ def test_a_sweep_continues_after_a_killed_job_and_the_same_line_completes_it(
     assert (jobs[1] / "summary.json").stat().st_mtime_ns == untouched
     whole = finished / "outputs" / "latest"
     assert (jobs[0] / "asset.ply").read_bytes() == (whole / "asset.ply").read_bytes()
+    lines = read_jsonl(jobs[0] / "metrics.jsonl")
+    assert [line["step"] for line in lines if line["kind"] == "step"] == list(range(1, 41))
+    logged = [line for line in lines if line["kind"] == "refine" or line["step"] in (1, *range(0, 41, 5))]
+    assert without_time(logged) == without_time(read_jsonl(whole / "metrics.jsonl"))
     assert {row["prompt"] for row in rows_of(table)} == {"a red cube"}
     assert all(float(row["psnr"]) > 5 and int(row["num_gaussians"]) > 0 for row in rows_of(table))
 

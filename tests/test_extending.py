@@ -155,7 +155,8 @@ def test_the_new_parts_are_in_the_help_and_found_by_their_declarations(place, mo
 @pytest.mark.slow
 def test_a_sweep_and_a_choice_use_the_metric(place, run):
     # ``run`` has written the program.
-    flags = f"--config-dir myconfigs {SMALL} metric=[outliers] hydra.run.dir=both"
+    small = f"{SMALL} steps=2 camera.size=16 exporter=[] metric=[outliers]"
+    flags = f"--config-dir myconfigs {small} hydra.run.dir=both"
     line = f"train prompt='a red torus' attempts=2 select=outliers {flags}"
     choice = run_line(place, f"PYTHONPATH=. cadam3d {line}")
     header = (place / "both/sweep.csv").read_text(encoding="utf-8").splitlines()[0]

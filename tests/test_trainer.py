@@ -110,18 +110,17 @@ def test_the_fallback_of_an_initializer_is_recorded_in_checkpoints():
 
 
 @pytest.mark.parametrize("densifier", ["cadam", "baseline", "absgs", "random", "mcmc"])
-@pytest.mark.parametrize("cut", [1, 4, 5])
-def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, densifier, cut):
+def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, densifier):
     trainer, whole = make([f"densifier={densifier}"])
     go(trainer, whole, tmp_path)
 
     _, state = make([f"densifier={densifier}"])
-    # The run stops early but has the schedules of the whole run.
-    go(replace(trainer, steps=cut), state, tmp_path)
-    torch.save(state.to_payload(), tmp_path / "half.pt")
-    resumed = restore(trainer, torch.load(tmp_path / "half.pt", weights_only=True))
-    assert go(trainer, resumed, tmp_path) is Outcome.FINISHED
-    assert same(whole.to_payload(), resumed.to_payload())
+    for cut in (1, 4, 5, 8):
+        # The run stops early but has the schedules of the whole run.
+        go(replace(trainer, steps=cut), state, tmp_path)
+        torch.save(state.to_payload(), tmp_path / "part.pt")
+        state = restore(trainer, torch.load(tmp_path / "part.pt", weights_only=True))
+    assert same(whole.to_payload(), state.to_payload())
 
 
 def test_a_reset_follows_the_refinement_of_its_step(tmp_path):

@@ -107,14 +107,15 @@ def is_number(value: object) -> TypeGuard[float]:
 def fits(value: object, kind: Any) -> bool:
     """Return whether ``value`` is of a ``kind``, an annotation that pydantic checks without conversions."""
     try:
-        _adapter(kind).validate_python(value, strict=True)
+        adapter_of(kind).validate_python(value, strict=True)
     except ValueError:
         return False
     return True
 
 
 @cache
-def _adapter(kind: Any) -> Any:
+def adapter_of(kind: Any) -> Any:
+    """Return pydantic's ``TypeAdapter`` of a type, which takes a millisecond to make."""
     from pydantic import TypeAdapter  # takes a tenth of a second to load
 
     return TypeAdapter(kind)

@@ -15,7 +15,7 @@ from annotated_types import Ge, Le
 from cadam3d.core.errors import UserError
 from cadam3d.core.number import COUNT, Number
 from cadam3d.core.outcome import Outcome
-from cadam3d.io.jsonl import Real, Whole, fits, is_number, read_json, read_jsonl
+from cadam3d.io.jsonl import Real, Whole, adapter_of, fits, is_number, read_json, read_jsonl
 from cadam3d.io.reading import read_yaml
 from cadam3d.io.run_folder import EVALUATION, HISTOGRAMS, METRICS, SUMMARY
 
@@ -58,10 +58,8 @@ def declared(facts: Mapping[str, Any]) -> dict[str, Number]:
 
     Declarations of another form than :meth:`Number.declaration` returns are left out.
     """
-    from pydantic import TypeAdapter  # takes a tenth of a second to load
-
     entries, found = facts.get(NUMBERS), {COUNT.name: COUNT}
-    adapter = TypeAdapter(Number)
+    adapter = adapter_of(Number)
     for name, entry in entries.items() if isinstance(entries, dict) else ():
         with suppress(ValueError, TypeError):
             number = adapter.validate_python({**entry, "name": name})

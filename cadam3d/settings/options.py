@@ -209,7 +209,8 @@ def _places(key: str) -> Iterator[dict[str, Any]]:
     group = key.partition(".")[0]
     for path in sorted(config_dir().glob("*.yaml"), key=lambda path: path.stem != "train"):
         yield read_yaml(path)
-    for name in sorted(option_names(group), key=lambda name: name != default_options().get(group)):
+    default = default_options().get(group)
+    for name in sorted(option_names(group), key=lambda name: name != default):
         yield read_option(group, name)
 
 
