@@ -26,7 +26,8 @@ def test_the_notebook_runs_and_leaves_no_files_behind(tmp_path, monkeypatch):
     # A cloud of Gaussians after three steps has a surface of very many triangles.
     text = text.replace("asset.mesh()", "asset.mesh(resolution=32)")
     text = text.replace('\\"exporter=[mesh]\\"', '\\"exporter=[mesh]\\", \\"exporter.mesh.resolution=32\\"')
-    assert "mesh(resolution=32)" in text and "mesh.resolution=32" in text
+    assert "mesh(resolution=32)" in text
+    assert "mesh.resolution=32" in text
     notebook = nbformat.reads(text, as_version=4)
     resources = {"metadata": {"path": str(tmp_path / "here")}}
     nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3", resources=resources).execute()
