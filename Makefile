@@ -1,4 +1,4 @@
-# make demo   install into .venv and train two objects: with the exact prior, and with a small network
+# make demo   install into .venv and train two objects: a real one with the exact prior, and a shape with a small network
 # make test   ruff, pyright and the whole test suite: everything that must hold before a merge
 # make check  ruff, pyright and the tests of what has changed since the last commit on main; less than a minute
 # make gpu    check, time and explain the CUDA kernels on the NVIDIA GPU of this machine, in at most 35 minutes and
@@ -19,7 +19,7 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --maxprocesses 8 
 .PHONY: demo test check gpu docs clean
 
 demo: .venv/.installed
-	$(BIN)/cadam3d train prompt="a red and yellow checkered torus"
+	$(BIN)/cadam3d train prompt="a teddy bear"
 	$(BIN)/cadam3d train prior=shapes_mvdream prompt="a red mushroom" truth=shapes
 	@echo "Both objects are in outputs. The second is in outputs/latest (asset.ply, turntable.mp4, preview.png, report.html)"
 

@@ -199,7 +199,7 @@ def test_the_ci_runs_make_test_and_nothing_else():
 @pytest.mark.parametrize(
     ("goal", "expected"),
     [
-        ("demo", 'train prompt="a red and yellow checkered torus"'),
+        ("demo", 'train prompt="a teddy bear"'),
         ("test", "-m pytest"),
         ("check", '-m "not slow"'),
         ("docs", "-m mkdocs build"),

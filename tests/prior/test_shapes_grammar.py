@@ -19,7 +19,7 @@ from cadam3d.prior.shapes.words import (
     noun_of,
 )
 
-PAGE = "docs/shapes.md"
+PAGE = "docs/exact.md"
 
 
 def refusal(prompt: str, key: str = "prompt") -> str:

@@ -73,7 +73,7 @@ def parse(prompt: str, key: str = "prompt") -> Sentence:
     words = words_of(prompt)
     unknown = [word for word in words if word not in vocabulary() and noun_of(word) is None]
     known = [word for group in known_words().values() for word in group]
-    require_words(key, unknown, known, "prior=shapes (docs/shapes.md)", EXAMPLE)
+    require_words(key, unknown, known, "prior=shapes (docs/exact.md)", EXAMPLE)
     reader = _Reader(key, prompt, [word for word in words if word not in FILLERS | ARTICLES])
     if sum(noun_of(word) is not None for word in words) > MAX_OBJECTS:
         raise reader.fail(f"at most {MAX_OBJECTS} objects")
