@@ -13,18 +13,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from cadam3d.callback.base import Callback
 from cadam3d.callback.row_history import RowHistory
 from cadam3d.core.checks import within
 from cadam3d.io.live import Watch, begin, publish, publish_state
 from cadam3d.io.run_folder import LIVE_SNAPSHOT
-from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainState
+from cadam3d.state import Outcome, RunContext, StepReport, TrainState
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(kw_only=True)
-class Live(Callback):
+class Live(RowHistory):
     """Write ``live/snapshot.bin`` and ``live/state.json`` while a page shows the run, and nothing otherwise.
 
     A snapshot has the layers of ``callback/row_history.py``. This callback never draws a random number, and
@@ -41,20 +40,15 @@ class Live(Callback):
     # The step of the last snapshot, and whether the run was paused then.
     _shown: tuple[int, bool] = field(default=(-1, False), init=False, repr=False)
     _loss: float | None = field(default=None, init=False, repr=False)
-    _history: RowHistory = field(default_factory=RowHistory, init=False, repr=False)
 
     def on_start(self, context: RunContext, state: TrainState) -> None:
         """Create ``live/`` and write the first numbers, so that a page finds them."""
-        self._history.start(state)
+        super().on_start(context, state)
         self._watch, self._works = Watch(context.folder), True
         self._due, self._shown, self._loss = 0.0, (-1, False), None
         with self._writing():
             begin(context.folder)
             self._write_state(context, state)
-
-    def on_refine(self, context: RunContext, state: TrainState, report: RefineReport) -> None:
-        """Follow the rows through the refinement."""
-        self._history.follow(report)
 
     def on_step(self, context: RunContext, state: TrainState, report: StepReport) -> None:
         """Write a snapshot if a page is open and one is due."""
@@ -78,7 +72,7 @@ class Live(Callback):
             return
         with self._writing():
             if state.step != self._shown[0]:
-                publish(context.folder / LIVE_SNAPSHOT, self._history.snapshot(context, state))
+                publish(context.folder / LIVE_SNAPSHOT, self.snapshot(context, state))
             self._write_state(context, state, is_paused=is_paused)
         self._shown = (state.step, is_paused)
         ended = time.monotonic()

@@ -4,15 +4,13 @@ import logging
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
 
 from cadam3d.callback.base import Callback
 from cadam3d.callback.metrics import step_numbers
-from cadam3d.core.checks import Count
+from cadam3d.core.checks import Count, require_extra
 from cadam3d.core.console import say
-from cadam3d.core.errors import UserError
 from cadam3d.io.image import step_picture
 from cadam3d.io.run_folder import PREVIEWS
 from cadam3d.state import RefineReport, RunContext, StepReport, TrainState
@@ -36,11 +34,7 @@ class Tracking(Callback):
     _numbers: dict[str, float] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if find_spec(self.package) is None:
-            raise UserError(
-                f"callback={self.package}: expected the package {self.package}, got none. "
-                f"Try: pip install '.[{self.package}]'"
-            )
+        require_extra(f"callback={self.package}", self.package, self.package)
         super().__post_init__()
 
     @abstractmethod

@@ -7,6 +7,7 @@ import difflib
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import cache, partial
+from importlib.util import find_spec
 from types import NoneType
 from typing import Annotated, Any, TypeGuard, get_args, get_type_hints
 
@@ -31,6 +32,12 @@ def require(claim: bool, key: str, *, expected: str, got: object, example: str =
     """Raise :class:`UserError` unless ``claim`` holds."""
     if not claim:
         raise fail(key, expected=expected, got=got, example=example)
+
+
+def require_extra(key: str, extra: str, *packages: str) -> None:
+    """Raise ``UserError`` unless the packages of an extra are installed, which the setting ``key`` needs."""
+    if missing := [name for name in packages if find_spec(name) is None]:
+        raise UserError(f"{key}: needs {', '.join(missing)}. Try: pip install '.[{extra}]'")
 
 
 def require_range(

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from cadam3d.core.checks import Declared, one_of
+from cadam3d.core.checks import Declared, one_of, require_extra
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderFn, Subject
 from cadam3d.io.frames import UPS
-from cadam3d.io.gaussforge import require_gaussforge
+from cadam3d.io.gaussforge import EXTRA
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +119,7 @@ class AssetExporter(Exporter):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.gaussforge:
-            require_gaussforge(self.gaussforge)
+            require_extra(self.gaussforge, *EXTRA)
 
     def export(self, gaussians: Gaussians, render: RenderFn, folder: Path) -> list[Path]:
         """Write the file and return its path."""

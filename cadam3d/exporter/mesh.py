@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from cadam3d.core.checks import one_of, whole
+from cadam3d.core.checks import one_of, require_extra, whole
 from cadam3d.core.console import say
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.mesh.surface import SurfaceSettings
 from cadam3d.core.rendering import RenderFn
 from cadam3d.exporter.base import Contents, Exporter
-from cadam3d.io.atlas import paint, require_xatlas
+from cadam3d.io.atlas import paint
 from cadam3d.io.frames import UPS
 from cadam3d.io.mesh import FORMATS, read_mesh, write_glb, write_mesh_ply, write_obj, write_stl
 
@@ -40,7 +40,7 @@ class MeshExporter(SurfaceSettings, Exporter):
         if self.texture is not None:
             has_textures = self.format not in ("ply", "stl")
             self.expect(has_textures, "texture", f"null, because {self.format} has no textures", "null")
-            require_xatlas()
+            require_extra("exporter.mesh.texture", "texture", "xatlas")
 
     @property
     def up_axis(self) -> str:

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from cadam3d.core.checks import one_of
+from cadam3d.core.checks import one_of, require_extra
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.exporter.base import AssetExporter
-from cadam3d.io.gaussforge import require_gaussforge, write_spz4
+from cadam3d.io.gaussforge import EXTRA, write_spz4
 from cadam3d.io.spz import write_spz
 
 
@@ -24,7 +24,7 @@ class SpzExporter(AssetExporter):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.version == 4:
-            require_gaussforge("exporter.spz.version")
+            require_extra("exporter.spz.version", *EXTRA)
 
     def write(self, path: Path, gaussians: Gaussians) -> None:
         """Write the file atomically. Raises ``UserError`` if it cannot be written."""

@@ -1,13 +1,11 @@
 """Atlas: unwraps a surface onto a picture with xatlas, and paints the picture texel by texel."""
 
 from collections.abc import Callable
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from cadam3d.core.errors import UserError
 from cadam3d.core.mesh.surface import Surface
 from cadam3d.io.mesh import Texture
 
@@ -21,12 +19,6 @@ PADDING = 4
 REACH = 1.5
 # Texels that are tested or painted at once; this bounds the memory.
 AT_ONCE = 1 << 20
-
-
-def require_xatlas() -> None:
-    """Raise ``UserError`` unless xatlas is installed, which only textures need."""
-    if find_spec("xatlas") is None:
-        raise UserError("exporter.mesh.texture: needs xatlas. Try: pip install '.[texture]'")
 
 
 def paint(surface: Surface, colors: ColorFn, size: int) -> Texture:

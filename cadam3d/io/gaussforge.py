@@ -32,7 +32,6 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +40,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require_choice
+from cadam3d.core.checks import require_choice, require_extra
 from cadam3d.core.console import working
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
@@ -51,7 +50,7 @@ from cadam3d.io.frames import UPS, file_to_world
 from cadam3d.io.ply import read_ply
 from cadam3d.io.reading import opened, unusable
 
-PACKAGE = "gaussforge"
+EXTRA = ("formats", "gaussforge")  # of this package, and what it installs
 # Numbers beyond these show no difference, but could cost the precision of the others.
 LARGEST_LOG = 20.0  # of scales and opacities
 LARGEST_SH = 20.0
@@ -78,12 +77,6 @@ if "error" in result:
     sys.exit(str(result["error"]))
 answer.write(result["data"])
 """
-
-
-def require_gaussforge(key: str) -> None:
-    """Raise ``UserError`` unless gaussforge is installed; ``key`` is the setting that needs it."""
-    if find_spec(PACKAGE) is None:
-        raise UserError(f"{key}: needs {PACKAGE}, which is not installed. Try: pip install '.[formats]'")
 
 
 def write_sog(path: Path, gaussians: Gaussians, *, up: str) -> None:
@@ -131,7 +124,7 @@ def _write(path: Path, gaussians: Gaussians, *, up: str, kind: str) -> None:
         "extras": {},
         "meta": {"shDegree": round((rest.shape[1] + 1) ** 0.5) - 1, "sourceFormat": "ply"},
     }
-    require_gaussforge(f"exporter.{kind}")
+    require_extra(f"exporter.{kind}", *EXTRA)
     content, problem = _forged(path.name, None, "write", (cloud, kind), {"spz_version": 4})
     if problem:
         raise UserError(f"{path}: gaussforge cannot write it ({problem}). Try: 'exporter=[ply]'")
@@ -146,7 +139,7 @@ def read_forged(path: Path, kind: str, *, up: str = "-y") -> Gaussians:
     read the file.
     """
     require_choice("up", up, UPS)
-    require_gaussforge(str(path))
+    require_extra(str(path), *EXTRA)
     with opened(path) as file:
         content = file.read()
     limits = (MOST_EXPANSION * len(content) + SPARE_BYTES, MOST_SECONDS)

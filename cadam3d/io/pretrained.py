@@ -10,14 +10,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from cadam3d.core.checks import fail, require
+from cadam3d.core.checks import fail, require, require_extra
 from cadam3d.core.errors import UserError
 from cadam3d.core.memory import is_out_of_memory
 from cadam3d.io.jsonl import read_json
@@ -77,7 +76,7 @@ class ModelSource:
         type instead. Without ``ask_hub``, only files on this disk count. Raises ``UserError`` if the extra is
         not installed, or with a reason for everything that was tried.
         """
-        require_extra(self.key)
+        require_extra(self.key, "diffusers", *EXTRA)
         paths = [self.path] if isinstance(self.path, str) else self.path
         models = [self._remote(ask_hub)] if paths is None else [self._local(path) for path in paths]
         for model in models:
@@ -301,13 +300,6 @@ def empty(kind: Any, config: Mapping[str, Any]) -> Any:
     if hasattr(kind, "from_config"):
         return kind.from_config(config)
     return kind(kind.config_class.from_dict(config))
-
-
-def require_extra(key: str) -> None:
-    """Raise ``UserError`` unless the libraries for pretrained models are installed."""
-    missing = [name for name in EXTRA if find_spec(name) is None]
-    if missing:
-        raise UserError(f"{key}: needs {', '.join(missing)}. Try: pip install '.[diffusers]'")
 
 
 def _read_entries(key: str, file: Path) -> dict[str, Any]:

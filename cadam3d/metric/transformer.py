@@ -13,11 +13,11 @@ from typing import Any, TypeVar
 
 import torch
 
-from cadam3d.core.checks import fail
+from cadam3d.core.checks import fail, require_extra
 from cadam3d.core.errors import UserError
 from cadam3d.io.asset_record import sha256_of
 from cadam3d.io.jsonl import read_json
-from cadam3d.io.pretrained import read_model, read_network, require_extra, short
+from cadam3d.io.pretrained import EXTRA, read_model, read_network, short
 
 CONFIG = "config.json"
 WEIGHTS = "model.safetensors"
@@ -35,7 +35,7 @@ def find_model(key: str, named: str, needed: tuple[str, ...] = NEEDED) -> "Trans
     ``key`` is the setting that names the model: a folder, or OWNER/NAME or OWNER/NAME@COMMIT on the hub.
     ``needed`` are patterns of the files that are downloaded. Raises ``UserError`` if it cannot be found.
     """
-    require_extra(key)
+    require_extra(key, "diffusers", *EXTRA)
     model, _, revision = named.partition("@")
     folder = Path(model).expanduser()
     if (folder / CONFIG).is_file():

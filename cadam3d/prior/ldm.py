@@ -14,9 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cadam3d.core.checks import fail
+from cadam3d.core.checks import fail, require_extra
 from cadam3d.core.errors import UserError
 from cadam3d.io.pretrained import (
+    EXTRA,
     LIBRARIES,
     ModelSource,
     Pretrained,
@@ -24,7 +25,6 @@ from cadam3d.io.pretrained import (
     fetch_file,
     read_model,
     read_tensors,
-    require_extra,
     short,
 )
 
@@ -118,7 +118,7 @@ class SingleFile(LatentDiffusion):
     @staticmethod
     def open(source: ModelSource, tokenizer: str) -> "SingleFile":
         """Return the model in ``source.path``. Its tensors are read when a part is loaded."""
-        require_extra(source.key)
+        require_extra(source.key, "diffusers", *EXTRA)
         file = Path(str(source.path)).expanduser()
         index = {name: list(kind) for name, kind in PARTS.items()}
         files = dict.fromkeys(PARTS, (file, ""))

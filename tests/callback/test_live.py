@@ -35,8 +35,8 @@ class Page(Callback):
         self.rows.append(
             (
                 state.step,
-                self.live._history.born.clone(),
-                self.live._history.is_selected.clone(),
+                self.live._born.clone(),
+                self.live._is_selected.clone(),
                 len(state.gaussians),
             )
         )

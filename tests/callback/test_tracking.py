@@ -11,12 +11,12 @@ import torch
 from composed import as_yaml, composed
 
 from cadam3d.build import components
-from cadam3d.callback import tracking
 from cadam3d.callback.base import Callback
 from cadam3d.callback.previews import Previews
 from cadam3d.callback.tensorboard import TensorBoard
 from cadam3d.callback.tracking import Tracking
 from cadam3d.callback.wandb import Wandb, brings_settings, known_run, refused
+from cadam3d.core import checks
 from cadam3d.core.console import heard_by
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import JOBS, occupant
@@ -134,12 +134,10 @@ def test_no_run_begins_in_a_folder_with_records_of_another_one(name, tmp_path):
 
 @pytest.mark.parametrize("name", ["tensorboard", "wandb"])
 def test_a_missing_package_names_its_extra(name, monkeypatch):
-    monkeypatch.setattr(tracking, "find_spec", lambda _: None)
+    monkeypatch.setattr(checks, "find_spec", lambda _: None)
     with pytest.raises(UserError) as raised:
         components(composed(f"callback=[{name}]", "prompt=a").callback, Callback, "callback")
-    assert str(raised.value) == (
-        f"callback={name}: expected the package {name}, got none. Try: pip install '.[{name}]'"
-    )
+    assert str(raised.value) == (f"callback={name}: needs {name}. Try: pip install '.[{name}]'")
 
 
 # --- TensorBoard ------------------------------------------------------------------------------------------

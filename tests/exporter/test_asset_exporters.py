@@ -3,6 +3,7 @@
 import pytest
 from formats import asset, errors, gaussforge_reads, likeness_db, random_gaussians
 
+from cadam3d.core import checks
 from cadam3d.core.errors import UserError
 from cadam3d.exporter.base import AssetExporter
 from cadam3d.exporter.compressed_ply import CompressedPlyExporter
@@ -12,7 +13,6 @@ from cadam3d.exporter.ply import PlyExporter
 from cadam3d.exporter.sog import SogExporter
 from cadam3d.exporter.splat import SplatExporter
 from cadam3d.exporter.spz import SpzExporter
-from cadam3d.io import gaussforge
 from cadam3d.io.asset_file import read_gaussians
 from cadam3d.io.frames import UPS, file_to_world
 
@@ -75,12 +75,10 @@ def test_spz_has_the_chosen_version(tmp_path):
     ],
 )
 def test_a_missing_package_is_reported_before_anything_runs(monkeypatch, name, settings, key):
-    monkeypatch.setattr(gaussforge, "find_spec", lambda _: None)
+    monkeypatch.setattr(checks, "find_spec", lambda _: None)
     with pytest.raises(UserError) as caught:
         built(name, **settings)
-    assert (
-        str(caught.value) == f"{key}: needs gaussforge, which is not installed. Try: pip install '.[formats]'"
-    )
+    assert str(caught.value) == f"{key}: needs gaussforge. Try: pip install '.[formats]'"
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import shutil
 import pytest
 import torch
 
+from cadam3d.core import checks
 from cadam3d.core.errors import UserError
 from cadam3d.io import pretrained
 from cadam3d.io.pretrained import ModelSource
@@ -241,6 +242,6 @@ def test_offline_mode_is_respected_and_reported(hub, monkeypatch):
 
 
 def test_a_missing_extra_is_reported_with_the_command_that_installs_it(monkeypatch):
-    monkeypatch.setattr(pretrained, "find_spec", lambda name: None if name == "diffusers" else object())
+    monkeypatch.setattr(checks, "find_spec", lambda name: None if name == "diffusers" else object())
     with pytest.raises(UserError, match=r"prior: needs diffusers. Try: pip install '\.\[diffusers\]'"):
         source().find(KINDS, OTHERS)

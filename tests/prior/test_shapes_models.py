@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 
 from cadam3d.build import component
 from cadam3d.commands import doctor
+from cadam3d.core import checks
 from cadam3d.core.errors import UserError
 from cadam3d.io import pretrained
 from cadam3d.io.jsonl import read_json
@@ -121,7 +122,7 @@ def test_a_package_without_models_is_reported(tmp_path, monkeypatch):
 
 def test_without_the_extra_the_message_says_what_to_install(models, monkeypatch, type_line):
     found = importlib.util.find_spec
-    monkeypatch.setattr(pretrained, "find_spec", lambda each: None if each == "diffusers" else found(each))
+    monkeypatch.setattr(checks, "find_spec", lambda each: None if each == "diffusers" else found(each))
     done = type_line("train", "prior=shapes_sd", "prompt=a red cube")
     assert done.message == "prior: needs diffusers. Try: pip install '.[diffusers]'"
     assert doctor.check_prior("shapes_sd").hint == ""
