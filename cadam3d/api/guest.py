@@ -15,8 +15,8 @@ from torch import Tensor
 
 from cadam3d.commands.beginning import messages
 from cadam3d.commands.messages import note
+from cadam3d.core.checks import fail
 from cadam3d.core.console import heard_by
-from cadam3d.core.errors import UserError
 from cadam3d.settings.compose import quote
 from cadam3d.settings.line import QUOTED, key_of
 
@@ -78,10 +78,8 @@ def require_free(overrides: tuple[str, ...], taken: Mapping[str, object]) -> Non
     """Raise ``UserError`` for an override of a key in ``taken``, which an argument sets already."""
     for override in overrides:
         if (key := key_of(override)) in taken:
-            raise UserError(
-                f"{key}: expected one value, got the argument {taken[key]!r} and {override!r}. "
-                "Try: the argument alone"
-            )
+            got = f"the argument {taken[key]!r} and {override!r}"
+            raise fail(key, expected="one value", got=got, example="the argument alone")
 
 
 def plain(value: Any) -> Any:

@@ -128,9 +128,8 @@ def logged_to(path: Path) -> Iterator[None]:
     file.addFilter(lambda record: record.name != messages.name)
     onward = _Onward(log.getEffectiveLevel())
     level, is_propagating = log.level, log.propagate
-    log.addHandler(file)
-    if is_propagating:
-        log.addHandler(onward)
+    for handler in (file, *([onward] if is_propagating else [])):
+        log.addHandler(handler)
     log.setLevel(min(logging.INFO, onward.level))
     log.propagate = False
     try:

@@ -9,8 +9,8 @@ from omegaconf import DictConfig, OmegaConf
 from cadam3d.commands.messages import note
 from cadam3d.commands.opened import OpenedAsset, open_asset, renderer
 from cadam3d.commands.writing import Output, chosen_exporters, run_exporters, write_files
+from cadam3d.core.checks import fail
 from cadam3d.core.console import show
-from cadam3d.core.errors import UserError
 from cadam3d.exporter.base import Exporter
 from cadam3d.io.asset_record import FileEntry, axes_of, facts_of, require_own_record, sha256_of, write_record
 from cadam3d.io.lock import taking_turns
@@ -119,10 +119,8 @@ def require_apart(asset: OpenedAsset, paths: Sequence[Path]) -> None:
     source = typed_path(str(asset.file))
     if any(typed_path(str(path)) == source for path in paths):
         free = numbered(asset.file.with_name(EXPORTS), first=1)
-        raise UserError(
-            f"output: expected another place than {shown(asset.file)}, which is exported, got the same. "
-            f"Try: {setting_word('output', shown(free))}"
-        )
+        expected = f"another place than {shown(asset.file)}, which is exported"
+        raise fail("output", expected=expected, got="the same", example=setting_word("output", shown(free)))
 
 
 def described(output: Output, asset: OpenedAsset) -> list[str]:

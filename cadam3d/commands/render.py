@@ -49,11 +49,8 @@ def _compare(cfg: DictConfig) -> tuple[list[Output], list[Subject]]:
     folders = [find_run(str(text)) for text in cfg.run]
     labels = default_labels(folders) if cfg.labels is None else [plain(label) for label in cfg.labels]
     if len(labels) != len(folders) or not all(0 < len(label) <= LONGEST_LABEL for label in labels):
-        raise fail(
-            "labels",
-            expected=f"one text of 1 to {LONGEST_LABEL} characters for each of the {len(folders)} runs",
-            got=labels,
-        )
+        expected = f"one text of 1 to {LONGEST_LABEL} characters for each of the {len(folders)} runs"
+        raise fail("labels", expected=expected, got=labels)
     assets = [open_run(folder, cfg.device) for folder in folders]
     subjects = [
         Subject(asset.gaussians, renderer(cfg.rasterizer, asset.gaussians), label)

@@ -173,13 +173,8 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
             _start_newborns(state, cloned)
         if splits:
             mask = torch.cat([is_split, is_split.new_zeros(cloned)])
-            split(
-                params=params,
-                optimizers=optimizers,
-                state=state,
-                mask=mask,
-                revised_opacity=self.revised_opacity,
-            )
+            rows = {"params": params, "optimizers": optimizers, "state": state, "mask": mask}
+            split(**rows, revised_opacity=self.revised_opacity)
             _start_newborns(state, 2 * splits)
         pruned = self._prune_gs(params, optimizers, state, step)
         if uses_radii:
@@ -187,10 +182,7 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
         # The replaced tensors are as large as the new ones.
         torch.cuda.empty_cache()
         if self.verbose:
-            print(
-                f"Step {step}: cloned {cloned} and split {splits} of {before} Gaussians, pruned {pruned}. "
-                f"Now there are {len(params['means'])}."
-            )
+            print(f"Step {step}: of {before} Gaussians {cloned} cloned, {splits} split, {pruned} pruned.")
 
     @torch.no_grad()
     def _measure(self, state: dict[str, Any], info: dict[str, Any], count: int, packed: bool) -> None:

@@ -21,13 +21,8 @@ def reset_opacities(
     number of lowered opacities.
     """
     require_range("value", value, above=0, below=1)
-    require(
-        logits.shape[:1] == rows.shape and logits.numel() == rows.numel(),
-        "rows",
-        expected=f"a mask of {len(logits)} Gaussians",
-        got=tuple(rows.shape),
-        example="reset_opacities(opacities, tracker.unreliable(), optimizer)",
-    )
+    is_mask = logits.shape[:1] == rows.shape and logits.numel() == rows.numel()
+    require(is_mask, "rows", expected=f"a mask of {len(logits)} Gaussians", got=tuple(rows.shape))
     chosen = rows.view_as(logits)
     ceiling = math.log(value / (1 - value))
     lowered = chosen & (logits > ceiling)

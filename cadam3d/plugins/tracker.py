@@ -80,12 +80,9 @@ class CAdamTracker(CAdamSettings):
         :class:`UserError` if the tracker follows another number of Gaussians, or if there is no gradient.
         """
         if gradient is None or gradient.shape != (len(self), 3):
-            raise fail(
-                "observe",
-                expected=f"a gradient of shape ({len(self)}, 3), one row for each Gaussian of the tracker",
-                got=None if gradient is None else tuple(gradient.shape),
-                example="tracker.append(count) or tracker.keep(mask)",
-            )
+            got = None if gradient is None else tuple(gradient.shape)
+            example = "tracker.append(count) or tracker.keep(mask)"
+            raise fail("observe", expected=f"a gradient of shape ({len(self)}, 3)", got=got, example=example)
         self.state = self.cadam().update(self.state, dense(gradient))
 
     def select(self) -> Bool[Tensor, "n"]:
@@ -108,13 +105,8 @@ class CAdamTracker(CAdamSettings):
 
     def keep(self, mask: Bool[Tensor, "n"]) -> None:
         """Remove all Gaussians that ``mask`` does not mark; the others keep their order and their history."""
-        require(
-            mask.shape == (len(self),),
-            "keep",
-            expected=f"a mask of {len(self)} Gaussians",
-            got=tuple(mask.shape),
-            example="tracker.keep(~pruned)",
-        )
+        expected = f"a mask of {len(self)} Gaussians"
+        require(mask.shape == (len(self),), "keep", expected=expected, got=tuple(mask.shape))
         self.follow(mask.nonzero()[:, 0])
 
     def follow(self, rows: Int[Tensor, "after"]) -> None:
@@ -123,14 +115,8 @@ class CAdamTracker(CAdamSettings):
         With it, Gaussians can change their order, and a child can take the place of its parent.
         """
         rows = rows.to(self.state.age.device)
-        in_range = bool(((rows >= -1) & (rows < len(self))).all())
-        require(
-            in_range,
-            "follow",
-            expected=f"row numbers from -1 to {len(self) - 1}",
-            got=rows.tolist(),
-            example="tracker.follow(torch.tensor([0, 1, -1]))",
-        )
+        is_in_range, expected = (rows >= -1) & (rows < len(self)), f"row numbers from -1 to {len(self) - 1}"
+        require(bool(is_in_range.all()), "follow", expected=expected, got=rows.tolist())
 
         def carry(history: Tensor) -> Tensor:
             # Row -1 is the last one, which holds zeros.

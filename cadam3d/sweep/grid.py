@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice, product
 from typing import Any, ClassVar
 
@@ -69,29 +69,21 @@ Axes = dict[str, list[AxisValue]]
 
 @dataclass(frozen=True)
 class Grid:
-    """A named comparison. Every job takes one setting of each axis of ``each`` and of one arm."""
+    """A named comparison. Every job takes one setting of each axis of ``each`` and of one arm.
 
-    each: Axes
-    arms: dict[str, Axes]  # at least one; named "" without a grid
+    Pydantic reads it from YAML, with a value or a list of values in place of each axis.
+    """
+
+    __pydantic_config__: ClassVar = {"extra": "forbid"}
+
+    each: dict[str, Any] = field(default_factory=dict)  # Axes
+    arms: dict[str, Any] = field(default_factory=lambda: {"": {}})  # Axes by name; "" without a grid
     prompts: str | None = None  # a file or a set; a line may choose others
     figures: list[str] | None = None  # of its report; None: all for which there are data
     paper_table: bool = False  # whether the sweep ends with the paper's table 1 of its jobs
 
 
 HasSetting = Callable[[Sequence[str], str], bool]
-
-
-@dataclass(frozen=True)
-class GridFile:
-    """The keys of a grid in YAML, which pydantic checks."""
-
-    __pydantic_config__: ClassVar = {"extra": "forbid"}
-
-    each: dict[str, Any] | None = None
-    arms: dict[str, dict[str, Any] | None] | None = None
-    prompts: str | None = None
-    figures: list[str] | None = None
-    paper_table: bool = False
 
 
 def read_grid(node: Any) -> Grid:
@@ -102,18 +94,13 @@ def read_grid(node: Any) -> Grid:
     from pydantic import TypeAdapter, ValidationError  # takes a tenth of a second to load
 
     try:
-        file = TypeAdapter(GridFile).validate_python({} if node is None else node)
+        grid = TypeAdapter(Grid).validate_python({} if node is None else node)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(["grid", *map(str, first["loc"])])
         raise UserError(f"{key}: {first['msg']}, got {first['input']!r}. Try: {EXAMPLE}") from error
-    return Grid(
-        each=_axes(file.each or {}, "grid.each"),
-        arms={name: _axes(axes or {}, f"grid.arms.{name}") for name, axes in (file.arms or {"": {}}).items()},
-        prompts=file.prompts,
-        figures=file.figures,
-        paper_table=file.paper_table,
-    )
+    arms = {name: _axes(axes or {}, f"grid.arms.{name}") for name, axes in grid.arms.items()}
+    return replace(grid, each=_axes(grid.each, "grid.each"), arms=arms)
 
 
 def read_line(overrides: Iterable[str]) -> Axes:
@@ -150,11 +137,11 @@ def expand(grid: Grid, line: Axes, has_setting: HasSetting = lambda *_: True) ->
     applies where neither the line nor the grid sets the same key and the job has such a setting. Raises
     ``UserError`` if the line makes two arms equal.
     """
-    common = {key: axis for key, axis in line.items() if key not in grid.each}
-    common |= {key: line.get(key, axis) for key, axis in grid.each.items()}
-    arms = {
-        name: {key: line.get(key, axis) for key, axis in axes.items()} for name, axes in grid.arms.items()
-    }
+    each: Axes = grid.each
+    arms: dict[str, Axes] = grid.arms
+    common = {key: axis for key, axis in line.items() if key not in each}
+    common |= {key: line.get(key, axis) for key, axis in each.items()}
+    arms = {name: {key: line.get(key, axis) for key, axis in axes.items()} for name, axes in arms.items()}
     number = sum(math.prod(map(len, [*common.values(), *axes.values()])) for axes in arms.values())
     expected = f"at most {MOST_JOBS} jobs"
     require(number <= MOST_JOBS, "sweep", expected=expected, got=number, example="cadam3d sweep --help")
@@ -226,7 +213,9 @@ def sweep_name(grid_name: str | None, line: Axes, prompts: PromptChoice | None =
     return f"{slug(*words)}_{_digest(parts)}{suffix}"
 
 
-def _axes(node: Mapping[str, Any], where: str) -> Axes:
+def _axes(node: Any, where: str) -> Axes:
+    is_mapping = isinstance(node, dict)
+    require(is_mapping, where, expected="keys with values", got=node, example=EXAMPLE)
     axes = {}
     for key, value in node.items():
         values = value if isinstance(value, list) else [value]

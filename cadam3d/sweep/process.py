@@ -17,6 +17,9 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
 from cadam3d.core.console import say
 from cadam3d.core.outcome import Outcome
 from cadam3d.core.signals import ENDING
@@ -26,6 +29,7 @@ from cadam3d.io.records import read_summary
 from cadam3d.io.run_folder import CONSOLE, ENDED, LOCK, RUN_FOLDER, STOP, SUMMARY
 from cadam3d.settings.compose import quote
 from cadam3d.sweep.folder import Plan, Row, is_complete, read_plan, rows_of
+from cadam3d.sweep.table import write_table
 
 # The folder from which this program imports cadam3d.
 PACKAGE_ROOT = Path(__file__).parents[2]
@@ -40,6 +44,17 @@ KILL = getattr(signal, "SIGKILL", signal.SIGTERM)
 MESSAGE, TRACEBACK = "cadam3d: ", "Traceback (most recent call last)"
 # Bytes at the end of the console that are searched for it.
 TAIL = 20_000
+
+
+def run(cfg: DictConfig) -> None:
+    """Run job number ``cfg.job`` of a sweep and bring the table up to date.
+
+    A launcher calls this for each job, on this machine or on another one. It raises nothing if a job fails or
+    is killed, because the table records that and the sweep continues.
+    """
+    sweep = Path(HydraConfig.get().sweep.dir)
+    run_job(sweep, cfg.job)
+    write_table(sweep)
 
 
 def run_job(sweep: Path, number: int) -> None:

@@ -38,7 +38,7 @@ from cadam3d.io.run_folder import (
 from cadam3d.settings.compose import flatten, quote, run_hydra
 from cadam3d.settings.line import NOT_OF_A_RUN, SWEEP_FOLDER
 from cadam3d.settings.trust import is_trusted, require_contained
-from cadam3d.sweep import worker
+from cadam3d.sweep import process
 from cadam3d.sweep.folder import Row, is_sweep, load, rows_of, write_plan
 from cadam3d.sweep.plan import Sweep, search_path
 from cadam3d.sweep.progress import reporting
@@ -153,7 +153,7 @@ def _launch(sweep: Sweep, rows: Sequence[Row]) -> str:
     if folder := sweep.line.options.config_dir:
         words = ["--config-dir", folder, *words]
     try:
-        run_hydra("jobs", words, worker.run)
+        run_hydra("jobs", words, process.run)
     except (UserError, HydraException, KeyboardInterrupt):
         raise
     except Exception as error:
@@ -175,9 +175,6 @@ def _report_results(sweep: Sweep, rows: Sequence[Row], problem: str) -> int:
         return 0
     counts = Counter(row.outcome for row in left)
     which = ", ".join(f"{number} {outcome}" for outcome, number in counts.items())
-    complain(
-        f"{len(left)} of {sweep.count(len(rows))} without a result ({which}); see {CONSOLE} in "
-        f"their folders, such as {shown(left[0].folder)}. "
-        "Type the same line again to continue."
-    )
+    place = f"{CONSOLE} in their folders, such as {shown(left[0].folder)}"
+    complain(f"{len(left)} of {sweep.count(len(rows))} without a result ({which}); see {place}.")
     return 1

@@ -37,12 +37,6 @@ def file(ball, tmp_path, monkeypatch) -> Path:
     return path
 
 
-def test_it_tells_what_it_is(ball, file):
-    assert len(ball) == 200
-    assert repr(ball) == "<Asset: 200 Gaussians, SH degree 0, 'a ball'>"
-    assert repr(load(file)) == "<Asset: 200 Gaussians, SH degree 0, 'ball', from ball.ply>"
-
-
 @pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.splat", "a.spz"])
 def test_a_format_that_is_exported_can_be_loaded(ball, file, name):
     assert ball.export(name) == [Path(name)]
@@ -168,11 +162,6 @@ def test_a_copy_shows_its_own_gaussians(ball):
         another.gaussians.means.add_(0.3)
         assert not np.array_equal(another.render(**SMALL), pictures)
     assert np.array_equal(ball.render(**SMALL), pictures)
-
-
-def test_a_file_needs_no_suffix_to_be_loaded(ball, file):
-    file.rename("ball")
-    assert len(load("ball")) == 200
 
 
 def test_the_mesh_is_closed_and_in_world_axes(ball):

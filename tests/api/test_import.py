@@ -45,11 +45,6 @@ def test_a_star_import_gives_the_public_names():
     assert names.keys() - {"__builtins__"} == NAMES
 
 
-def test_an_unknown_name_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="has no attribute 'trian'"):
-        cadam3d.trian  # noqa: B018
-
-
 def test_type_checkers_see_the_same_names():
     stub = ast.parse((REPOSITORY / "cadam3d/__init__.pyi").read_text(encoding="utf-8"))
     imported = {

@@ -74,14 +74,6 @@ def test_stepping_gives_the_bytes_of_a_run(run, trainer, tmp_path, monkeypatch):
     assert (tmp_path / "asset.ply").read_bytes() == (run.folder / "asset.ply").read_bytes()
 
 
-def test_another_seed_is_another_run(trainer):
-    first, second = (trainer.start(seed=seed) for seed in (3, 4))
-    assert same(first.gaussians, trainer.start().gaussians)
-    assert not same(first.gaussians, second.gaussians)
-    with pytest.raises(cadam3d.UserError, match="seed: expected a whole number"):
-        trainer.start(seed=-1)
-
-
 def test_the_modes_of_torch_are_those_of_the_caller_between_steps(run, trainer):
     dtype = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
@@ -170,8 +162,3 @@ def test_every_component_that_is_given_is_used():
 def test_what_cannot_work_is_refused(words, objects, message, without_type_checks):
     with pytest.raises(cadam3d.UserError, match=message):
         cadam3d.compose("prompt=a red cube", *words, **objects)
-
-
-def test_a_prompt_is_needed():
-    with pytest.raises(cadam3d.UserError, match="prompt: no value given"):
-        cadam3d.compose()

@@ -211,11 +211,6 @@ def test_an_error_has_the_text_of_the_command_line(words, type_line):
     assert [path.name for path in Path().iterdir()] == ["taken"]
 
 
-def test_a_prompt_is_needed():
-    with pytest.raises(cadam3d.UserError, match="prompt: no value given"):
-        cadam3d.train(None)
-
-
 @pytest.mark.parametrize(
     ("words", "settings", "message"),
     [
@@ -228,11 +223,6 @@ def test_a_prompt_is_needed():
 def test_what_only_python_can_get_wrong_is_refused(words, settings, message, without_type_checks):
     with pytest.raises(cadam3d.UserError, match=message):
         cadam3d.train(*words, **settings)
-
-
-def test_a_folder_without_a_run_is_refused(tmp_path):
-    with pytest.raises(cadam3d.UserError, match=r"expected the folder of a run"):
-        cadam3d.Run(tmp_path)
 
 
 def test_a_run_that_has_not_ended_shows_what_it_has(run, tmp_path):

@@ -15,11 +15,6 @@ def line(*words: str) -> str:
     return describe_schedule(build_trainer(compose(["prompt=a red cube", *words, "prior=tiny"]), CPU))
 
 
-def test_the_default_run_grows_and_resets():
-    expected = "6 refinements (steps 150 to 400, every 50), 1 opacity reset (step 300), a last pruning."
-    assert line() == expected
-
-
 @pytest.mark.parametrize("name", ["none", "mcmc", "random", "random_annealed", "cadam_no_reset"])
 def test_a_densifier_without_resets_announces_none_and_marks_no_gaussian(name):
     densifier = component(compose(["prompt=a red cube", f"densifier={name}"]).densifier)

@@ -49,11 +49,6 @@ def run(tmp_path, monkeypatch, state):
         yield run
 
 
-def test_without_a_request_the_run_goes_on(run):
-    assert not run.ask()
-    assert not run.waits
-
-
 def test_a_run_waits_until_the_pause_is_withdrawn(run, capsys):
     run.while_waiting = lambda: live.withdraw(run.folder, "pause") if len(run.waits) == 3 else None
     assert not run.ask("pause")

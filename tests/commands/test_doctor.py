@@ -74,11 +74,6 @@ def test_a_package_that_does_not_import_is_broken_and_has_a_hint(monkeypatch):
     assert finding.hint == "Try: pip install --force-reinstall tqdm"
 
 
-def test_no_ffmpeg_is_broken(monkeypatch):
-    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/nowhere/ffmpeg")
-    assert attempt("ffmpeg", doctor.check_ffmpeg, "hint").verdict == BROKEN
-
-
 def test_a_gpu_that_torch_cannot_use_gets_a_hint(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(doctor.shutil, "which", lambda name: "/bin/true")

@@ -139,7 +139,7 @@ def test_the_exported_file_itself_is_never_overwritten(output, run_folder, type_
     before = (run_folder / "asset.ply").read_bytes()
     message = type_line("export", f"run={run_folder}", f"output={output}", "exporter.ply.up=+z").message
     assert message == (
-        "output: expected another place than a run/asset.ply, which is exported, got the same. "
+        "output: expected another place than a run/asset.ply, which is exported, got 'the same'. "
         "Try: 'output=a run/exports'"
     )
     assert (run_folder / "asset.ply").read_bytes() == before

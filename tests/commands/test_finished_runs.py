@@ -1,6 +1,5 @@
 """The commands render, export, eval and view, with a run folder, a sweep folder or a single file."""
 
-import json
 import shlex
 import shutil
 from pathlib import Path
@@ -11,7 +10,6 @@ from composed import as_yaml
 
 from cadam3d.commands import view
 from cadam3d.commands.render import default_labels
-from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io import caption
 from cadam3d.io.caption import Caption
@@ -287,26 +285,6 @@ def test_view_shows_the_report_of_a_sweep_and_writes_it_if_it_is_missing(tmp_pat
         assert code == 0
         assert "sweep/report.html" in out
     assert written == [sweep]
-
-
-def test_numbers_that_cannot_be_saved_are_printed(run_folder, type_line, monkeypatch, tmp_path):
-    make_sweep(tmp_path / "sweep", "a")
-    shutil.copytree(run_folder, tmp_path / "sweep" / "a")
-
-    def refuse(path, value):
-        raise UserError(f"{path.name}: cannot be written")
-
-    monkeypatch.setattr("cadam3d.commands.eval.write_json", refuse)
-    for place, printed in (("a run", "psnr   "), ("sweep", " dB  ")):
-        result = type_line("eval", f"run={place}", *SMALL)
-        assert (result.code, result.message) == (1, "eval.json: cannot be written")
-        assert printed in result.out
-
-
-def test_the_json_of_eval_is_strict(run_folder, type_line):
-    type_line("eval", f"run={run_folder}", *SMALL)
-    text = (run_folder / "eval.json").read_text(encoding="utf-8")
-    assert json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
 
 
 # --- several runs side by side -----------------------------------------------------------------------------

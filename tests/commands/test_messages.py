@@ -7,7 +7,6 @@ import pytest
 from cadam3d.commands import messages
 from cadam3d.core.errors import UserError
 from cadam3d.rasterizer import auto, cpu
-from cadam3d.rasterizer.base import Backend
 
 NEEDED = "rasterizer=cpu needs a C++ compiler. Install one"
 SMALL = [
@@ -43,14 +42,6 @@ def test_a_note_is_printed_once(capsys):
     messages.note("mind the gap")
     messages.note("mind the step")
     assert capsys.readouterr().err == "Note: mind the gap\nNote: mind the step\n"
-
-
-def test_a_backend_is_noted_only_if_it_replaces_a_faster_one(capsys):
-    messages.note_backend(Backend("cpu"))
-    messages.note_backend(Backend("reference", reason="No compiler. Install one"))
-    assert capsys.readouterr().err == (
-        "Note: rendering with rasterizer=reference: No compiler. Install one\n"
-    )
 
 
 def test_training_without_a_compiler_is_noted_once_and_recorded(type_line, no_compiler, tmp_path):

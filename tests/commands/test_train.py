@@ -69,11 +69,6 @@ def test_the_sizes_in_the_summary_are_those_on_disk(pad_sh, up, degree, exporter
     check_sizes(folder)
 
 
-def test_every_value_of_every_setting_is_tested():
-    pads, ups, degrees, _ = (set(column) - {None} for column in zip(*SETTINGS, strict=True))
-    assert (pads, ups, degrees) == (set(range(4)), {"-y", "+y", "+z"}, set(range(4)))
-
-
 def test_without_metrics_the_summary_still_has_the_bytes_of_the_asset(train):
     folder = train(*SMALL, "hydra.run.dir=run", "exporter=[ply]", "exporter.ply.pad_sh=3", "metric=[]")
     summary = json.loads((folder / "summary.json").read_text())

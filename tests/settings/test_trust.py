@@ -299,11 +299,6 @@ def components_of(plain: object, folder: Path, **options: Any) -> DictConfig:
     return read_components(path, ("prior", "rasterizer"), [CONFIGS], **options)
 
 
-def test_only_what_is_measured_is_read_from_a_configuration(config, tmp_path):
-    config["densifier"] = {"_target_": PAYLOAD}
-    assert set(components_of(config, tmp_path)) == {"prompt", "seed", "prior", "rasterizer"}
-
-
 def test_a_payload_in_a_component_that_is_built_is_refused(config, tmp_path):
     components_of(config, tmp_path)
     places = [
@@ -551,12 +546,6 @@ def test_a_trusted_run_may_run_its_code(run_folder, marker, type_line):
     assert marker.exists()
 
 
-@pytest.mark.parametrize("value", ["yes", "1", "null", "[true]"])
-def test_trust_is_true_or_false(value, run_folder, type_line):
-    assert "trust: expected true or false" in type_line("train", f"resume={run_folder}", f"trust={value}").err
-    assert "trust: expected true or false" in type_line("train", "prompt=a", f"trust={value}").err
-
-
 def test_a_link_in_a_run_is_refused_before_anything_is_written(run_folder, tmp_path, type_line):
     (tmp_path / "precious").write_text("precious")
     (run_folder / "train.log").symlink_to(tmp_path / "precious")
@@ -579,19 +568,6 @@ def test_nothing_is_written_through_a_link_of_a_run(command, run_folder, tmp_pat
     result = type_line(command, f"run={run_folder}")
     assert (result.code, "Try: output=/" in result.err) == (1, True)
     assert not list((tmp_path / "precious").iterdir())
-
-
-def test_a_pickled_configuration_is_never_loaded(type_line):
-    assert "--experimental-rerun" in type_line("train", "--experimental-rerun=config.pickle").err
-
-
-@pytest.mark.parametrize("name", ["..", ".", "", "/tmp", "a/b", "../x", "a\\b", "a\0b"])
-def test_the_job_of_a_sweep_is_inside_the_folder_of_the_sweep(name, tmp_path, type_line):
-    job = {"arm": "", "folder": name, "overrides": [], "swept": {}}
-    plan = {"cwd": "/", "flags": [], "threads": None, "jobs": [job]}
-    (tmp_path / "jobs.json").write_text(json.dumps(plan))
-    result = type_line("eval", f"run={tmp_path}")
-    assert (result.code, "jobs.json: not the plan of a sweep" in result.err) == (1, True)
 
 
 def test_a_component_of_config_dir_is_measured_without_trust(tmp_path, monkeypatch, type_line):

@@ -84,13 +84,6 @@ def test_the_psnr_of_an_asset_that_may_face_any_side_is_that_at_the_best_turn():
     assert (found.best, found.number.name) == (1, "psnr_turned")
 
 
-def test_the_reason_gives_the_number_of_every_attempt_and_their_mean():
-    assert choose(attempts(22.0, 24.5, 21.0), "psnr").sentence == (
-        "Best of 3 by PSNR: seed=1. All: 24.50 dB (seed=1), 22.00 dB (seed=0), 21.00 dB (seed=2). "
-        "Mean: 22.50 dB."
-    )
-
-
 # --- the command ------------------------------------------------------------------------------------------
 
 

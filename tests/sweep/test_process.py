@@ -14,7 +14,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from cadam3d import job
 from cadam3d.io.lock import try_lock
 from cadam3d.io.run_folder import STOP
 from cadam3d.sweep import process
@@ -230,7 +229,7 @@ def test_a_machine_without_unix_locks_and_signals_can_import_every_module():
         "    if mode == 1 and fd in locked: raise PermissionError\n"
         "    (locked.append if mode == 1 else locked.remove)(fd)\n"
         "sys.modules['msvcrt'] = types.SimpleNamespace(locking=locking, LK_NBLCK=1, LK_UNLCK=2)\n"
-        "import cadam3d.job, cadam3d.sweep.start, cadam3d.sweep.worker\n"
+        "import cadam3d.job, cadam3d.sweep.start\n"
         "from cadam3d.io.lock import try_lock, unlock\n"
         "file = open(sys.argv[1], 'w')\n"
         "fd = file.fileno()\n"
@@ -316,23 +315,6 @@ def test_a_job_ends_with_the_process_that_started_it():
     while is_alive(pid):
         assert time.monotonic() < deadline
         time.sleep(0.1)
-
-
-def test_a_job_ignores_signals_that_are_meant_for_its_launcher(monkeypatch):
-    handlers = []
-    monkeypatch.setattr("cadam3d.job.end_with", lambda parent: None)
-    monkeypatch.setattr(
-        "cadam3d.cli.main", lambda: handlers.extend(map(signal.getsignal, process.ANNOUNCING))
-    )
-    monkeypatch.setattr(sys, "argv", ["to be restored"])
-    before = [(number, signal.getsignal(number)) for number in process.ANNOUNCING]
-    try:
-        job.main(["1", "train", "seed=0"])
-        assert handlers == [signal.SIG_IGN] * 2
-        assert sys.argv == ["cadam3d", "train", "seed=0"]
-    finally:
-        for number, handler in before:
-            signal.signal(number, handler)
 
 
 def is_alive(pid: int) -> bool:

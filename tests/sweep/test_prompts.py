@@ -14,7 +14,6 @@ from cadam3d.sweep.folder import Job, Plan, load, write_plan
 from cadam3d.sweep.grid import Grid, expand, prompt_axis, read_grid, read_line, sweep_name
 from cadam3d.sweep.plan import read_sweep
 from cadam3d.sweep.prompts import PromptChoice, read_choice
-from cadam3d.sweep.table import brief
 
 # A line of a text file cannot hold these.
 LINES = ["one\ntwo", "one\r\n\u2028 two"]
@@ -173,11 +172,6 @@ def test_jobs_of_a_prompt_are_compared_whether_or_not_they_have_its_settings(tmp
     assert [row.brought for row in load(tmp_path)] == [job.brought for job in jobs]
     ball_cat, shap_e_cat, ball_dog, _ = (result.cell for result in results.read(tmp_path))
     assert ball_cat == shap_e_cat != ball_dog
-
-
-def test_a_long_prompt_of_several_lines_is_one_short_cell():
-    assert brief("one\n  two") == "one two"
-    assert len(brief("x" * 500)) == 80
 
 
 def test_every_prompt_reaches_its_job_literally_with_its_settings(tmp_path):

@@ -17,7 +17,6 @@ from omegaconf import OmegaConf
 
 from cadam3d import cli
 from cadam3d.core.errors import UserError
-from cadam3d.core.signals import TOGETHER_SECONDS
 from cadam3d.io.run_folder import JOBS
 from cadam3d.launch import read_line
 from cadam3d.settings import compose as settings
@@ -142,15 +141,6 @@ def test_the_table_has_one_row_per_job(hydra_sweep):
     assert all((only_sweep() / row["folder"] / "summary.json").is_file() for row in rows)
 
 
-def test_each_job_is_reported_as_it_ends(sweep):
-    lines = sweep("prompt=a cube", "seed=0,1,2").out.splitlines()
-    assert lines[0].startswith("3 jobs in multirun/")
-    assert lines[1].startswith("[1/3] seed=0: 5 Gaussians, 20.25 dB, 2 s; about ")
-    assert lines[3] == "[3/3] seed=2: 5 Gaussians, 20.25 dB, 2 s"
-    assert f"3 jobs: {only_sweep()}/sweep.csv" in lines
-    assert lines[-1] == f"report: {only_sweep()}/report.html"
-
-
 def test_a_grid_gives_its_name_and_its_arms(sweep):
     result = sweep("prompt=a cube", "grid=densifiers", "seed=0,1")
     rows = read_table(Path("multirun/densifiers"))
@@ -184,21 +174,6 @@ def test_failed_and_killed_jobs_are_rows_and_the_other_jobs_still_run(sweep, cal
     assert result.code == 1
     assert "3 of 6 jobs without a result (2 failed, 1 killed)" in result.err
     assert f"such as multirun/x/{rows[1]['folder']}." in result.err
-
-
-def test_the_table_is_right_after_every_job(hydra_sweep, monkeypatch):
-    seen = []
-    original = write_table
-
-    def note(folder):
-        rows = original(folder)
-        seen.append([row["outcome"] for row in read_table(folder)])
-        return rows
-
-    monkeypatch.setattr("cadam3d.sweep.worker.write_table", note)
-    hydra_sweep("prompt=a cube", "seed=0,1,2")
-    finished, waiting = "finished", "unfinished"
-    assert seen == [[finished, waiting, waiting], [finished, finished, waiting], [finished] * 3]
 
 
 def test_the_last_of_several_writers_leaves_the_latest_state(tmp_path, monkeypatch):
@@ -416,20 +391,6 @@ def test_sigint_stops_all_running_jobs_and_the_table_is_right(launcher, running,
     outcomes = [row["outcome"] for row in read_table(tmp_path / "x")]
     assert sorted(outcomes) == ["interrupted"] * running + ["unfinished"] * (6 - running)
     assert out.count("interrupted") == 2 * running  # when it ended, and in the table
-
-
-def test_a_second_sigint_ends_at_once(start_sweep, tmp_path):
-    process = start_sweep("prompt=a stuck one", "seed=0,1", "hydra.sweep.dir=x")
-    wait_for(tmp_path, "x/*/waiting", process)
-    process.send_signal(signal.SIGINT)
-    assert process.stderr.readline() == "\n"
-    assert "interrupt again to stop at once" in process.stderr.readline()
-    time.sleep(1.1 * TOGETHER_SECONDS)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=30)
-    assert process.returncode == 130
-    assert err.endswith("cadam3d: interrupted\n")
-    assert [row["outcome"] for row in read_table(tmp_path / "x")] == ["unfinished"] * 2
 
 
 @pytest.mark.slow
@@ -660,25 +621,6 @@ def test_grids_and_components_are_found_on_a_search_path(sweep, tmp_path):
     ]
 
 
-def test_the_report_and_its_table_follow_the_sweep(sweep, monkeypatch):
-    made = []
-    monkeypatch.setattr(
-        "cadam3d.report.write_sweep", lambda folder: (made.append(folder), folder / "report.html")[1]
-    )
-    monkeypatch.setattr("cadam3d.report.comparison", lambda folder: "a table")
-    out = sweep("prompt=a cube", "grid=densifiers").out
-    assert made == [Path("multirun/densifiers").resolve()]
-    assert out.endswith("within cells:\na table\n\nreport: multirun/densifiers/report.html\n")
-
-
-def test_the_terminal_shows_only_jobs_without_a_result_of_a_long_table(sweep, monkeypatch):
-    monkeypatch.setattr(start, "LONGEST", 1)
-    out = sweep("prompt=a cube,a bug").out
-    table = out[out.index("\njob ") :]
-    assert "failed" in table
-    assert "finished" not in table
-
-
 def test_preparing_a_sweep_needs_no_torch(start_sweep, tmp_path):
     code = "import sys, cadam3d.launch, cadam3d.commands.sweep; assert 'torch' not in sys.modules"
     subprocess.run([PYTHON, "-c", code], check=True, cwd=REPOSITORY)
@@ -710,9 +652,3 @@ def test_a_dry_run_refuses_results_with_other_settings_like_the_sweep_itself(swe
     result = sweep(*line, "dry_run=true")
     assert result.code == 1
     assert result.err.endswith("Try: hydra.sweep.dir=here-2\n")
-
-
-def test_a_dry_run_is_on_or_off(sweep):
-    result = sweep("prompt=a cube", "seed=0,1", "dry_run=7")
-    assert result.err.startswith("cadam3d: dry_run: expected true or false, got 7.")
-    assert sweep("prompt=a cube", "dry_run=true", command="train").code == 1
