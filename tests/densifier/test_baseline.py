@@ -109,17 +109,6 @@ def test_the_accumulators_are_cleared_by_every_refinement():
     assert after.sightings.tolist() == [0] * 4
 
 
-def test_observe_modifies_neither_the_old_state_nor_the_signal():
-    before = baseline().observe(baseline().init_state(4, CPU), signal(gradients(2, 4)))
-    copy = {name: rows.clone() for name, rows in before.to_dict().items()}
-    pixel = gradients(2, 4, seed=1)
-    evidence = signal(pixel.clone())
-    for views in VIEWS:
-        baseline(views=views).observe(before, evidence)
-    assert all(torch.equal(rows, copy[name]) for name, rows in before.to_dict().items())
-    assert torch.equal(evidence.means2d, pixel)
-
-
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 @pytest.mark.parametrize("views", VIEWS)
 def test_a_gradient_that_is_not_finite_counts_as_not_seen(views, bad):
@@ -168,9 +157,3 @@ def test_statistics_are_computed_from_the_mean_norms():
     assert numbers["gradient_p50"] == pytest.approx(5e-4)
     assert numbers["gradient_p90"] == pytest.approx(9e-4)
     assert numbers["share_above_tau_pos"] == pytest.approx(6 / 11)
-
-
-def test_an_empty_scene_has_empty_masks_and_no_statistics():
-    state = baseline().observe(baseline().init_state(0, CPU), signal(torch.zeros(2, 0, 2)))
-    assert baseline().select(state, STEP, DRAWS).shape == (0,)
-    assert baseline().statistics(state, STEP) == {}

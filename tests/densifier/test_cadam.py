@@ -23,7 +23,6 @@ from cadam3d.core.edit import RowEdit
 from cadam3d.core.errors import UserError
 from cadam3d.core.reductions import quantile
 from cadam3d.core.schedule import Linear
-from cadam3d.densifier.cadam import CAdamState
 from cadam3d.densifier.refine import Refine
 
 # The moments (eq. 8 and 10).
@@ -53,16 +52,6 @@ def test_a_constant_gradient_is_recovered_without_bias_at_every_age(age):
 def test_snr_of_pure_noise_settles_at_the_root_of_one_minus_beta1_over_one_plus_beta1():
     ratio = snr(cadam(), observe(cadam(), noise(200, 3000)))
     assert float(ratio.square().mean().sqrt()) == pytest.approx(math.sqrt(0.1 / 1.9), rel=0.02)
-
-
-def test_observe_modifies_neither_the_old_state_nor_the_signal():
-    before = observe(cadam(), noise(3, 5))
-    copy = CAdamState(**{name: tensor.clone() for name, tensor in before.to_dict().items()})
-    evidence = signal(noise(1, 5, seed=1)[0])
-    gradient = evidence.means.clone()
-    cadam().observe(before, evidence)
-    assert all(torch.equal(tensor, getattr(copy, name)) for name, tensor in before.to_dict().items())
-    assert torch.equal(evidence.means, gradient)
 
 
 def test_observe_never_waits_for_the_device():
@@ -283,13 +272,6 @@ def test_statistics_are_computed_from_drift_and_noise():
     assert numbers["share_above_tau_SNR"] == pytest.approx(float((ratio > 0.1).float().mean()))
     assert numbers["drift_threshold"] == pytest.approx(float(torch.quantile(drift, 0.9)), rel=1e-5)
     assert numbers["drift_median"] == pytest.approx(float(torch.quantile(drift, 0.5)), rel=1e-5)
-
-
-def test_an_empty_scene_has_empty_masks_and_no_statistics():
-    state = observe(cadam(), torch.zeros(2, 0, 3))
-    assert cadam().select(state, STEP, DRAWS).shape == (0,)
-    assert cadam().unreliable(state).shape == (0,)
-    assert cadam().statistics(state, STEP) == {}
 
 
 def test_the_selective_reset_needs_a_threshold():

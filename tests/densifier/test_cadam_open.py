@@ -19,7 +19,6 @@ from evidence import (
 )
 
 from cadam3d.core.errors import UserError
-from cadam3d.densifier.cadam import CAdamState
 
 
 def test_with_the_values_of_the_paper_it_equals_cadam():
@@ -45,17 +44,6 @@ def test_moments_are_those_of_adam_to_the_bit_if_nothing_is_skipped(n):
     saved = optimizer.state_dict()
     assert torch.equal(state.m, saved["exp_avg"]["means"])
     assert torch.equal(state.v, saved["exp_avg_sq"]["means"])
-
-
-def test_observe_modifies_neither_the_old_state_nor_the_signal():
-    before = observe(open_cadam(), noise(3, 5))
-    copy = CAdamState(**{name: tensor.clone() for name, tensor in before.to_dict().items()})
-    evidence = signal(noise(1, 5, seed=1)[0])
-    gradient = evidence.means.clone()
-    for choice in ({"invisible": "skip"}, {"grad_norm": "per_step_rms"}):
-        open_cadam(**choice).observe(before, evidence)
-        assert all(torch.equal(tensor, getattr(copy, name)) for name, tensor in before.to_dict().items())
-        assert torch.equal(evidence.means, gradient)
 
 
 def test_unseen_gaussians_age_and_lose_snr_under_zero_and_keep_their_state_under_skip():
