@@ -15,9 +15,8 @@ from cadam3d.augmentation import Augmentation
 from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
-from cadam3d.core.checks import fail, require, require_choice, require_whole
+from cadam3d.core.checks import fail, require, require_choice
 from cadam3d.core.errors import UserError
-from cadam3d.core.schedule import FAR_STEP
 from cadam3d.densifier.base import Densifier
 from cadam3d.densifier.refine import Refine
 from cadam3d.exposure import Exposure
@@ -54,7 +53,6 @@ def build_trainer(
         require(is_right, name, expected=f"an object of class {kind.__name__}", got=given[name])
         return given[name]
 
-    require_whole("steps", cfg.steps, low=1, high=FAR_STEP)
     refine: Refine = part("refine", Refine)
     require(
         refine.steps == cfg.steps,

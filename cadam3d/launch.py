@@ -21,7 +21,6 @@ from cadam3d.settings.compose import Call, compose, run_hydra
 from cadam3d.settings.help import help_text
 from cadam3d.settings.line import HYDRA_KEYS, OF_SWEEPS, Line, key_of, quoted, read_flags, resumed
 from cadam3d.settings.options import with_example
-from cadam3d.sweep.plan import require_attempts
 
 EXPORTING = ("render", "export")  # the commands with output=
 MULTIRUN = ("--multirun", "-m")  # flags that make a sweep of a training
@@ -163,8 +162,6 @@ def _composed(line: Line) -> DictConfig:
     runs = cfg.get("run")
     is_comparison = OmegaConf.is_list(runs) and line.command != "render"
     require(not is_comparison, "run", expected="one run", got=runs, example="run=outputs/latest")
-    if is_training:
-        require_attempts(cfg.get("attempts", 1))
     if of_sweeps and cfg.get("attempts", 1) == 1:
         key = key_of(of_sweeps[0])
         raise fail(key, expected="a sweep or several attempts", got=of_sweeps[0], example="attempts=2")

@@ -16,7 +16,6 @@ from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.checks import require_range
 from cadam3d.core.device import upload_together
 from cadam3d.core.edit import RowState
 from cadam3d.core.gaussians import Gaussians
@@ -92,8 +91,6 @@ class Trainer:
     callbacks: Sequence[Callback]
 
     def __post_init__(self) -> None:
-        require_range("steps", self.steps, low=1)
-        require_range("views", self.views, low=1, high=10_000)
         self.camera.check_views(self.views)
 
     def step(self, state: TrainState, embedding: PromptEmbedding) -> tuple[StepReport, RefineReport | None]:

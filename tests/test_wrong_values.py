@@ -31,7 +31,7 @@ from cadam3d.core.errors import UserError
 from cadam3d.core.memory import is_out_of_memory
 from cadam3d.core.pictures import require_angles
 from cadam3d.core.schedule import Schedule, Steps
-from cadam3d.settings.check import require_settings
+from cadam3d.settings.check import BOUNDS, _types_of_settings, require_settings
 from cadam3d.settings.compose import compose
 from cadam3d.settings.options import config_dir
 from cadam3d.sweep.grid import MOST_JOBS, expand, read_grid, read_line
@@ -242,6 +242,16 @@ def test_a_setting_outside_of_components_has_a_value_of_its_type(name, value):
         require_settings(changed("camera=orbit", name, value))
 
 
+def test_numbers_outside_of_components_have_bounds_and_are_refused_beyond_them():
+    number = {int, float}
+    typed = {name: {hint, *get_args(hint)} for name, hint in _types_of_settings().items()}
+    assert {name for name, hints in typed.items() if hints & number} <= BOUNDS.keys() | {"job"}
+    for name, check in BOUNDS.items():
+        for value in beyond(check):
+            with pytest.raises(UserError, match=rf"^{name}: expected "):
+                require_settings({name: value})
+
+
 # --- command lines -----------------------------------------------------------------------------------------
 
 
@@ -269,7 +279,7 @@ WRONG_LINES = {
     "+callback.foo.bar=1": "callback.foo: is not chosen",
     "callback.progress.refresh_seconds=abc": "callback.progress.refresh_seconds: expected a finite number",
     "camera.size=10000000": "camera.size: expected a number >= 1 and <= 16384",
-    "views=100000000000": "views: expected a number",
+    "views=100000000000": "views: expected a whole number",
     "initializer.count=1000000000000": "initializer.count: expected a whole number",
     "exporter.turntable.size=10000000": "exporter.turntable.size: expected a whole number",
     "metric.fidelity.views=1000000000000": "metric.fidelity.views: expected a whole number >= 1 and <=",

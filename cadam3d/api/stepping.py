@@ -146,7 +146,6 @@ def compose(  # noqa: PLR0913  (one argument per component)
     with as_guest(), completing():
         cfg, _ = prepare("train", overrides)
         device = resolve_device(cfg.device)
-        require_whole("seed", cfg.seed, low=0)
         trainer = build_trainer(cfg, device, given)
         if initializer is None:
             initializer = component(cfg.initializer, Initializer, "initializer")

@@ -12,7 +12,6 @@ from cadam3d import report
 from cadam3d.build import component
 from cadam3d.commands.measuring import build_metrics, measure, rebuild_start
 from cadam3d.commands.opened import find_run, open_run, renderer
-from cadam3d.core.checks import require_whole
 from cadam3d.core.console import complain, show
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
@@ -71,7 +70,6 @@ def evaluate(cfg: DictConfig, call: Call, folder: Path) -> dict[str, Any]:
 
     def start() -> Gaussians:
         settings = components_of(("initializer",))
-        require_whole("seed", settings.seed, low=0)
         initializer: Initializer = component(settings.initializer, Initializer, "initializer")
         return rebuild_start(settings.prompt, initializer, settings.seed, device)
 

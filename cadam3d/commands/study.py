@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.commands.messages import note
 from cadam3d.commands.opened import open_run, renderer
-from cadam3d.core.checks import fail, require_range, require_whole
+from cadam3d.core.checks import fail
 from cadam3d.core.console import say, show
 from cadam3d.core.errors import UserError
 from cadam3d.io.asset_record import sha256_of
@@ -62,7 +62,7 @@ def run(cfg: DictConfig, _call: Call) -> None:
 
 def _write(cfg: DictConfig) -> None:
     """Write ``study.html`` and ``key.json`` into ``output``, and print what they contain."""
-    settings = _settings(cfg)
+    settings = ClipSettings(**{each.name: cfg[each.name] for each in fields(ClipSettings)})
     # The text that raters read before they begin.
     consent = CONSENT if cfg.consent is None else read_text(expanded(cfg.consent), largest=LARGEST_CONSENT)
     pairs = _pairs(cfg)
@@ -87,15 +87,6 @@ def _write(cfg: DictConfig) -> None:
 def _runs_in(pairs: Sequence[RunPair]) -> list[StudyRun]:
     """Return every run of the pairs once."""
     return list(dict.fromkeys(run for pair in pairs for run in pair.runs))
-
-
-def _settings(cfg: DictConfig) -> ClipSettings:
-    """Return how clips are rendered, after all other settings of a page have been checked."""
-    require_whole("seed", cfg.seed, low=0)
-    require_range("catch_share", cfg.catch_share, low=0, high=1)
-    if cfg.pairs is not None:
-        require_whole("pairs", cfg.pairs, low=1)
-    return ClipSettings(**{each.name: cfg[each.name] for each in fields(ClipSettings)})
 
 
 def _pairs(cfg: DictConfig) -> list[RunPair]:
@@ -151,7 +142,6 @@ def _evaluate(cfg: DictConfig) -> None:
     from cadam3d.study.analysis import analyse
     from cadam3d.study.summary import markdown
 
-    require_range("least_caught", cfg.least_caught, low=0, high=1)
     files, left = read_files(find_files(_texts(cfg.answers)))
     path = expanded(cfg.output if cfg.key is None else cfg.key)
     key = read_key(path := path / KEY if path.is_dir() else path)

@@ -21,7 +21,6 @@ from cadam3d.commands.beginning import (
 from cadam3d.commands.control import Control
 from cadam3d.commands.finishing import Results, measure_memory, print_result, summarize
 from cadam3d.commands.resuming import keep_start, start_or_resume
-from cadam3d.core.checks import require_whole
 from cadam3d.core.console import say
 from cadam3d.core.device import resolve_device
 from cadam3d.core.signals import ENDING, StopOnSignal
@@ -52,7 +51,6 @@ def optimise(
     folder changes.
     """
     device = resolve_device(cfg.device)
-    require_whole("seed", cfg.seed, low=0)
     resume = Path(str(cfg.resume)) if cfg.resume else None
     with (
         occupied(call.folder, is_chosen=call.has_chosen_folder, resume=resume) as folder,

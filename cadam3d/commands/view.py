@@ -13,7 +13,6 @@ from omegaconf import DictConfig
 
 from cadam3d import report
 from cadam3d.commands.opened import find_asset, find_run, require_one
-from cadam3d.core.checks import require_whole
 from cadam3d.core.console import show
 from cadam3d.core.errors import UserError
 from cadam3d.io.asset_file import read_gaussians
@@ -29,7 +28,6 @@ from cadam3d.viewer.pack import pack
 
 def run(cfg: DictConfig, _call: Call) -> None:
     """Serve the page of ``run=`` or ``ply=`` until Ctrl-C. For a sweep, open its report instead."""
-    require_whole("port", cfg.port, low=0, high=65535)
     require_one(cfg)
     if cfg.run is not None and is_sweep(folder := typed_path(str(cfg.run))):
         page = folder / REPORT

@@ -34,7 +34,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from cadam3d.core.checks import require_choice
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import SH_C0
@@ -50,7 +49,6 @@ from cadam3d.io.encoding import (
     unit_quats,
     with_largest,
 )
-from cadam3d.io.frames import UPS
 from cadam3d.io.gathering import gathered
 from cadam3d.io.ply import REST_SIZES, VERTEX, rest_size
 from cadam3d.io.ply_tables import PlyHeader, columns, header_text, read_header, read_tables
@@ -124,7 +122,6 @@ def read_compressed_ply(path: Path, *, up: str = "-y") -> Gaussians:
     ``up`` is the up axis of files that do not record it; files of this project do. Raises ``UserError`` if
     ``path`` is not such a file, or has numbers that are not finite.
     """
-    require_choice("up", up, UPS)
     header = read_header(path)
     size = rest_size(header, "sh")
     rest_names = [f"f_rest_{i}" for i in range(size)]

@@ -40,13 +40,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cadam3d.core.checks import require_choice, require_extra
+from cadam3d.core.checks import require_extra
 from cadam3d.core.console import working
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.atomic import replacing
 from cadam3d.io.encoding import in_file_axes, unit_quats
-from cadam3d.io.frames import UPS, file_to_world
+from cadam3d.io.frames import file_to_world
 from cadam3d.io.ply import read_ply
 from cadam3d.io.reading import opened, unusable
 
@@ -138,7 +138,6 @@ def read_forged(path: Path, kind: str, *, up: str = "-y") -> Gaussians:
     ``up`` is the up axis of the file. Raises ``UserError`` if gaussforge is not installed, or if it cannot
     read the file.
     """
-    require_choice("up", up, UPS)
     require_extra(str(path), *EXTRA)
     with opened(path) as file:
         content = file.read()

@@ -43,7 +43,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from cadam3d.core.checks import require_choice
 from cadam3d.core.gaussians import Gaussians, concatenate
 from cadam3d.core.rotation import rotation_matrices
 from cadam3d.core.sh import MAX_DEGREE, SH_C0, sh_basis
@@ -56,7 +55,7 @@ from cadam3d.io.encoding import (
     to_bytes,
     unit_quats,
 )
-from cadam3d.io.frames import UPS, band_matrix
+from cadam3d.io.frames import band_matrix
 from cadam3d.io.gathering import gathered
 from cadam3d.io.gltf import DAMAGES, attribute, linear, read_gltf, srgb, write_gltf
 from cadam3d.io.reading import unusable
@@ -129,7 +128,6 @@ def read_glb(path: Path, *, up: str = "+y") -> Gaussians:
 
     ``up`` is the up axis of the file; glTF defines +y. Raises ``UserError`` if ``path`` is not such a file.
     """
-    require_choice("up", up, UPS)
     document, body = read_gltf(path)
     try:
         found = list(_primitives(document))

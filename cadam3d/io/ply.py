@@ -29,7 +29,6 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE
 from cadam3d.io.atomic import replacing
 from cadam3d.io.encoding import as_tensor, in_file_axes
-from cadam3d.io.frames import UPS
 from cadam3d.io.gathering import gathered
 from cadam3d.io.ply_tables import PlyHeader, columns, header_text, read_header, read_tables
 from cadam3d.io.reading import unusable
@@ -91,7 +90,6 @@ def read_ply(path: Path, *, up: str = "-y") -> Gaussians:
     the up axis of files that do not record it; files of this project do. Raises ``UserError`` if ``path`` is
     not such a file, or has numbers that are not finite.
     """
-    require_choice("up", up, UPS)
     header = read_header(path)
     size = rest_size(header, VERTEX)
     rest = [f"f_rest_{i}" for i in range(size)]

@@ -23,7 +23,6 @@ from pathlib import Path
 
 import numpy as np
 
-from cadam3d.core.checks import require_choice
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import SH_C0
 from cadam3d.io.atomic import replacing
@@ -37,7 +36,7 @@ from cadam3d.io.encoding import (
     to_bytes,
     unit_quats,
 )
-from cadam3d.io.frames import UPS, file_to_world
+from cadam3d.io.frames import file_to_world
 from cadam3d.io.reading import opened, unusable
 
 RECORD = np.dtype(
@@ -70,7 +69,6 @@ def read_splat(path: Path, *, up: str = "-y") -> Gaussians:
     ``up`` is the up axis of the file. Raises ``UserError`` if the size of the file is not a multiple of 32
     bytes, or if a position or a scale is not a possible one.
     """
-    require_choice("up", up, UPS)
     with opened(path) as file:
         content = file.read()
     if len(content) % RECORD.itemsize:

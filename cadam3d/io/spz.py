@@ -40,7 +40,6 @@ from pathlib import Path
 
 import numpy as np
 
-from cadam3d.core.checks import require_choice
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.sh import MAX_DEGREE
@@ -56,7 +55,6 @@ from cadam3d.io.encoding import (
     unit_quats,
     with_largest,
 )
-from cadam3d.io.frames import UPS
 from cadam3d.io.gathering import gathered
 from cadam3d.io.reading import opened, unusable
 
@@ -114,7 +112,6 @@ def read_spz(path: Path, *, up: str = "-y") -> Gaussians:
     ``up`` is the up axis of the file. Never allocates more than 20 times the size of the file and 64 MB.
     Raises ``UserError`` if ``path`` is not such a file, or would need more memory.
     """
-    require_choice("up", up, UPS)
     with opened(path) as file:
         content = file.read()
     inflate = zlib.decompressobj(wbits=31)  # gzip, whose checksum is verified

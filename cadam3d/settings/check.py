@@ -12,15 +12,16 @@ import inspect
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import is_dataclass
-from functools import cache, reduce
+from functools import cache, partial, reduce
 from operator import or_
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
 
-from cadam3d.core.checks import fail
+from cadam3d.core.checks import Check, fail, require_color, whole, within
 from cadam3d.core.errors import UserError
+from cadam3d.core.schedule import FAR_STEP
 from cadam3d.io.reading import is_readable, read_yaml
 from cadam3d.settings.compose import flatten
 from cadam3d.settings.line import key_of
@@ -46,6 +47,25 @@ OF_NULL = {
     **dict.fromkeys(("run", "runs", "answers"), str | Sequence[str]),
     **dict.fromkeys(("labels", "arms"), Sequence[str]),
     **dict.fromkeys(("pairs", "job"), int),
+}
+# The bounds of settings outside of components, also of those that may be null.
+BOUNDS: dict[str, Check] = {
+    "seed": whole(low=0),
+    "steps": whole(low=1, high=FAR_STEP),
+    "views": whole(low=1, high=10_000),
+    "attempts": whole(low=1, high=1000),
+    "port": whole(low=0, high=65535),
+    "pairs": whole(low=1),
+    "catch_share": within(low=0, high=1),
+    "least_caught": within(low=0, high=1),
+    # The clips of a study.
+    "size": whole(low=1, high=2048),
+    "frames": whole(low=1, high=1000),
+    "seconds": within(low=0.5, high=60),
+    "elevation_deg": within(low=-90, high=90),
+    "distance": within(above=0, high=1000),
+    "backdrop": partial(require_color),
+    "quality": whole(low=1, high=100),
 }
 WORDS: dict[Any, str] = {
     int: "a whole number",
@@ -94,13 +114,15 @@ def require_effective(cfg: DictConfig, command: str, overrides: Sequence[str]) -
 
 
 def require_settings(values: Mapping[Any, Any]) -> None:
-    """Raise ``UserError`` unless all settings outside of components have values of their types.
+    """Raise ``UserError`` unless all settings outside of components have values of their types and ranges.
 
     ``values`` has the value of each setting by its name. A prompt needs something to make.
     """
     for name, declared in _types_of_settings().items():
         if name in values:
             _require(values[name], declared, name)
+            if name in BOUNDS and values[name] is not None:
+                BOUNDS[name](name, _plain(values[name]))
     if not values.get("prompt", "unused").strip():
         raise fail("prompt", expected="what to make", got=values["prompt"], example=example_word("prompt"))
 

@@ -14,14 +14,11 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from cadam3d.core.cameras import turntable
-from cadam3d.core.checks import require_color, require_range, require_whole
 from cadam3d.core.rendering import RenderFn
 from cadam3d.io.image import to_uint8
 
 FOV_Y_DEG = 40.0  # at distance 3 the unit ball just fits
 VIEWS_AT_ONCE = 4  # bounds the memory of rendering
-MOST_FRAMES = 1000
-LARGEST = 2048  # pixels
 # A ruined clip keeps this many pixels per side of each frame, and each of them gets noise.
 RUINED_SIZE = 12  # pixels
 RUINED_NOISE = 70.0  # standard deviation, of 255
@@ -43,15 +40,6 @@ class ClipSettings:
     distance: float  # world units, from the camera to the origin
     backdrop: Sequence[float]  # RGB in [0, 1]
     quality: int  # of WebP, in [1, 100]
-
-    def __post_init__(self) -> None:
-        require_whole("size", self.size, low=1, high=LARGEST)
-        require_whole("frames", self.frames, low=1, high=MOST_FRAMES)
-        require_range("seconds", self.seconds, low=0.5, high=60)
-        require_range("elevation_deg", self.elevation_deg, low=-90, high=90)
-        require_range("distance", self.distance, above=0, high=1000)
-        require_color("backdrop", self.backdrop)
-        require_whole("quality", self.quality, low=1, high=100)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from statistics import mean
 
 from omegaconf import DictConfig
 
-from cadam3d.core.checks import fail, require_choice, require_whole
+from cadam3d.core.checks import fail, require_choice
 from cadam3d.core.errors import UserError
 from cadam3d.core.number import COUNT, Number, preferred
 from cadam3d.core.outcome import Outcome
@@ -78,7 +78,6 @@ def read_attempts(cfg: DictConfig, line: Line) -> Sweep:
     by another number, find the attempts that exist. Raises ``UserError`` for settings that cannot be combined
     with attempts.
     """
-    require_whole("seed", cfg.seed, low=0)
     if cfg.get("resume") is not None:
         raise fail("attempts", expected="1 with resume=", got=cfg.attempts)
     given = {key_of(override) for override in line.overrides}

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from cadam3d.core.checks import fail, require, require_whole
+from cadam3d.core.checks import fail, require
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import RUN_FOLDER, typed_path
 from cadam3d.settings.advice import explain
@@ -36,7 +36,6 @@ PARENT = Path("multirun")
 VALUE = re.compile(r"[A-Za-z_][\w.]*=(?!.*\$\{)", re.DOTALL)
 GRID_KEY = re.compile(r"(grid|prompts)($|\.)")
 REFUSED_KEY = re.compile(r"hydra\.run\.dir$|hydra\.sweep\.subdir$|hydra[./]sweeper($|\.)")
-MOST_ATTEMPTS = 1000
 NOTHING_TO_SWEEP = "sweep: nothing to sweep over. Try: densifier=baseline,cadam"
 
 
@@ -309,11 +308,6 @@ def compose_all(jobs: Sequence[Job], composer: Composer) -> list[Composed]:
             arm = f"arm {job.arm}: " if job.arm else ""
             raise UserError(f"{arm}{with_example(reason)}") from error
     return composed
-
-
-def require_attempts(attempts: object) -> None:
-    """Raise ``UserError`` for a wrong value of the setting ``attempts``."""
-    require_whole("attempts", attempts, low=1, high=MOST_ATTEMPTS)
 
 
 def search_path(overrides: Sequence[str]) -> list[str]:
