@@ -144,18 +144,6 @@ def test_a_file_that_does_not_record_its_axes_is_read_with_one_line_about_the_as
     assert not messages_of(lambda: read_gaussians(path, up="-y"))
 
 
-@pytest.mark.parametrize("kind", FORGED)
-def test_a_damaged_file_is_one_message_that_names_it(tmp_path, kind):
-    write, suffix = WRITERS[kind]
-    path = tmp_path / f"a{suffix}"
-    write(path, one_gaussian(), up="-y")
-    path.write_bytes(path.read_bytes()[:-30])
-    with pytest.raises(UserError) as caught:
-        read_gaussians(path)
-    assert str(caught.value).startswith(f"{path}: ")
-    assert "\n" not in str(caught.value)
-
-
 def test_an_unknown_axis_is_refused(tmp_path):
     with pytest.raises(UserError, match="up: expected"):
         read_gaussians(tmp_path / "a.ply", up="up")

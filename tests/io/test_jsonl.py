@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from cadam3d.core.errors import UserError
-from cadam3d.io import jsonl
 from cadam3d.io.jsonl import append_jsonl, read_json, read_jsonl, truncate_after, write_json
 
 
@@ -95,18 +94,6 @@ def test_truncating_keeps_the_bytes_of_what_stays(tmp_path):
 def test_a_json_file_is_read_as_it_was_written(tmp_path):
     write_json(tmp_path / "s.json", {"prompt": "Ü", "path": Path("/a"), "counts": (1, 2)})
     assert read_json(tmp_path / "s.json") == {"prompt": "Ü", "path": "/a", "counts": [1, 2]}
-
-
-def test_a_json_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
-    write_json(tmp_path / "s.json", {"step": 1})
-
-    def fails(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(jsonl, "to_json", fails)
-    with pytest.raises(UserError, match="No space left"):
-        write_json(tmp_path / "s.json", {"step": 2})
-    assert read_json(tmp_path / "s.json") == {"step": 1}
 
 
 @pytest.mark.parametrize("content", [None, "{cut", ""])

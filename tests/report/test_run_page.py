@@ -14,7 +14,6 @@ from declarations import declared
 from cadam3d import report
 from cadam3d.build import component
 from cadam3d.core.chart import Chart, Curve
-from cadam3d.core.errors import UserError
 from cadam3d.core.palette import css
 from cadam3d.io.declarations import write_declarations
 from cadam3d.report import run_page, write_report
@@ -268,9 +267,3 @@ def test_a_page_stays_small_and_its_identifiers_differ(tmp_path):
     assert len(html) < 250_000
     ids = re.findall(r' id="([^"]*)"', html)
     assert len(ids) == len(set(ids)) > 0
-
-
-def test_a_folder_that_cannot_be_written_is_a_user_error(tmp_path):
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(UserError, match="cannot be written"):
-        write_report(tmp_path / "file")
