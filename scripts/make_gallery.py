@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from omegaconf import OmegaConf
 from PIL import Image
 
 import cadam3d
@@ -22,8 +23,8 @@ from cadam3d.core.cameras import Cameras, orbit
 from cadam3d.io.atomic import replacing
 from cadam3d.io.caption import Caption, side_by_side
 from cadam3d.io.image import to_uint8
+from cadam3d.io.records import read_config
 from cadam3d.prior.objects.catalog import read_catalog
-from cadam3d.settings.compose import load_config
 from cadam3d.sweep.folder import Row, load
 
 OUTPUT = Path(__file__).parent.parent / "docs" / "images" / "objects.webp"
@@ -41,7 +42,7 @@ def strip(rows: Mapping[str, Row]) -> UInt8[np.ndarray, "h w 3"]:
     """Return the pictures of one object: its truth, and its asset of every arm."""
     first = next(iter(rows.values()))
     prompt = first.swept["prompt"]
-    truth = component(load_config(first.folder / "config.yaml").prior).truth(prompt)
+    truth = component(OmegaConf.create(read_config(first.folder / "config.yaml")).prior).truth(prompt)
     pictures = [to_uint8(truth.images(camera(), torch.ones(1, 3))[0, 0])]
     captions = [Caption(prompt, credit(prompt))]
     for arm, row in rows.items():
