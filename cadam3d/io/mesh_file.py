@@ -186,7 +186,7 @@ def _tint(part: trimesh.Trimesh, plain: Sequence[float]) -> Float[np.ndarray, "n
 
 
 def _picture(part: trimesh.Trimesh) -> np.ndarray:
-    """Return the picture of a part as RGBA; one pixel if it has none. Alpha is 255 unless it cuts holes."""
+    """Return the picture of a part as RGBA; one pixel if it has none. Holes are where alpha is below 1/2."""
     visual: Any = part.visual
     if visual.kind != "texture":
         return np.full((1, 1, 4), 255, np.uint8)
@@ -194,15 +194,16 @@ def _picture(part: trimesh.Trimesh) -> np.ndarray:
     mode = getattr(material, "alphaMode", None) or ("MASK" if hasattr(material, "image") else "OPAQUE")
     factor = getattr(material, "baseColorFactor", None)
     factor = np.ones(4) if factor is None else np.asarray(factor) / 255
+    cutoff = getattr(material, "alphaCutoff", None)
+    solid = factor[3] * 0.5 / max(0.5 if cutoff is None else cutoff, 0.01)
     if image is None or visual.uv is None:
         is_linear = hasattr(material, "baseColorFactor")
         flat = 255 * srgb(factor[:3]) if is_linear else np.asarray(material.main_color)[:3]
-        alpha = 255 if mode == "OPAQUE" else round(255 * factor[3])
+        alpha = 255 if mode == "OPAQUE" else min(255, round(255 * solid))
         return np.array([[[*flat.round(), alpha]]], dtype=np.uint8)
     image.thumbnail((FINEST, FINEST))
     rgba = np.array(image.convert("RGBA"))
-    if mode == "OPAQUE":
-        rgba[..., 3] = 255
+    rgba[..., 3] = 255 if mode == "OPAQUE" else (rgba[..., 3] * solid).clip(max=255).round()
     if (factor < 1).any():
         rgba[..., :3] = (255 * srgb(linear(rgba[..., :3] / 255) * factor[:3])).round()
     return rgba

@@ -15,6 +15,7 @@ from cadam3d.core.mesh.surface import Surface
 from cadam3d.core.sh import SH_C0
 from cadam3d.initializer.mesh import Mesh
 from cadam3d.io.mesh import Texture, write_glb, write_mesh_ply, write_obj
+from cadam3d.io.mesh_file import read_mesh
 
 CPU = torch.device("cpu")
 GREY = [0.5, 0.5, 0.5]
@@ -171,6 +172,26 @@ def test_a_texture_that_we_exported_has_its_colors(tmp_path):
     )
     expected = torch.tensor([[200, 30, 90]]).expand(2000, 3) / 255
     torch.testing.assert_close(rgb(build(tmp_path / "m.glb", up="y")), expected)
+
+
+@pytest.mark.parametrize(("cutoff", "factor", "solid"), [(None, 255, 2), (0.2, 255, 3), (0.5, 140, 1)])
+def test_holes_are_where_alpha_times_that_of_the_material_is_below_the_cutoff(
+    tmp_path, cutoff, factor, solid
+):
+    picture = Image.new("RGBA", (4, 1))
+    for column, alpha in enumerate((0, 64, 192, 255)):
+        picture.putpixel((column, 0), (255, 255, 255, alpha))
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=picture,
+        baseColorFactor=[255, 255, 255, factor],
+        alphaMode="MASK",
+        alphaCutoff=cutoff,
+    )
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    visual = trimesh.visual.TextureVisuals(uv=square[:, :2], material=material)
+    mesh = trimesh.Trimesh(square, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False)
+    read = read_mesh(str(save(mesh, tmp_path / "m.glb")), "prior.path")
+    assert (read.textures.texels[:4, 3] >= 128).sum() == solid
 
 
 def test_the_material_of_a_glb_multiplies_the_colors_of_its_vertices(tmp_path):
