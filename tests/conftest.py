@@ -73,6 +73,11 @@ def _check_types() -> None:
     install_import_hook([".".join(parts).removesuffix(".__init__") for parts in names], "typechecker.check")
 
 
+def pytest_xdist_auto_num_workers():
+    """Return one process more than there are cores, because some tests wait for processes or for a signal."""
+    return (os.cpu_count() or 1) + 1
+
+
 def pytest_ignore_collect(collection_path, config):
     """Ignore files without tests of a GPU if only those run, because their imports may not be installed."""
     if config.option.markexpr != "gpu" or not re.fullmatch(r"test_.*\.py", collection_path.name):

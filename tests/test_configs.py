@@ -162,13 +162,12 @@ def test_the_momentum_ablation_needs_its_threshold():
     assert component(node).limits_drift
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_a_component_declares_no_default_values(path):
+def test_a_component_declares_no_default_values():
     """Numbers are only in the YAML files. Schedules and paths inside a component may have defaults."""
-    content = composed(path)
-    for node in [content] if "_target_" in content else content.values():
-        settings = [field for field in dataclasses.fields(class_of(node)) if field.init]
-        assert not [field.name for field in settings if field.default is not dataclasses.MISSING]
+    contents = map(composed, FILES)
+    nodes = [node for each in contents for node in ([each] if "_target_" in each else each.values())]
+    settings = [(node, field) for node in nodes for field in dataclasses.fields(class_of(node)) if field.init]
+    assert not [(node, field) for node, field in settings if field.default is not dataclasses.MISSING]
 
 
 @pytest.mark.parametrize("path", GLOBAL, ids=name_of)
@@ -191,12 +190,12 @@ def test_an_option_that_chooses_others_sets_nothing_inside_their_groups(path):
     assert "relative_distance" not in other.camera
 
 
-@pytest.mark.parametrize("path", [path for path in FILES if path not in GLOBAL], ids=name_of)
-def test_an_option_of_a_group_with_several_choices_has_its_own_node(path):
-    header = path.read_text(encoding="utf-8").splitlines()[0]
-    wanted = f"# @package {path.parent.name}.{path.stem}"
-    is_one_of_several = path.parent.name in (*SEVERAL, "regularizer") and path.stem != "none"
-    assert header == wanted if is_one_of_several else not header.startswith("# @package")
+def test_an_option_of_a_group_with_several_choices_has_its_own_node():
+    for path in [path for path in FILES if path not in GLOBAL]:
+        header = path.read_text(encoding="utf-8").splitlines()[0]
+        wanted = f"# @package {path.parent.name}.{path.stem}"
+        is_one_of_several = path.parent.name in (*SEVERAL, "regularizer") and path.stem != "none"
+        assert header == wanted if is_one_of_several else not header.startswith("# @package"), path
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)

@@ -235,19 +235,11 @@ def jobs_here(monkeypatch) -> None:
 
 
 @pytest.mark.usefixtures("jobs_here")
-def test_attempts_survive_a_kill_in_the_middle_and_the_best_is_linked(tmp_path, type_in):
-    words = [*BARE, "metric=[fidelity]", "metric.fidelity.views=1", "attempts=3", "select=psnr"]
-    words.append("hydra.run.dir=cube")
+def test_attempts_are_different_assets_and_the_best_is_linked(tmp_path, type_in):
+    """What happens to attempts that are killed is tested with a small program in place of training."""
+    words = [*BARE, "metric=[fidelity]", "metric.fidelity.views=1", "attempts=3", "select=psnr", "steps=12"]
     folder = tmp_path / "cube"
-    process = start(tmp_path, "train", *words)
-    wait_for(folder / "seed=1" / "config.yaml", process)
-    process.kill()  # SIGKILL: the first attempt has a result, and the second one trains
-    process.communicate()
-    untouched = (folder / "seed=0" / "summary.json").stat().st_mtime_ns
-    assert not (folder / "best").exists()
-
-    out, _ = type_in(tmp_path, "train", *words)
-    assert (folder / "seed=0" / "summary.json").stat().st_mtime_ns == untouched
+    out, _ = type_in(tmp_path, "train", *words, "hydra.run.dir=cube")
     psnr = [json.loads((folder / f"seed={seed}" / "summary.json").read_text())["psnr"] for seed in range(3)]
     assert len(set(psnr)) == 3  # three different assets
     best = psnr.index(max(psnr))

@@ -73,7 +73,7 @@ def test_a_fuzzy_asset_is_smoothed_with_a_note_and_a_clean_one_without(tmp_path,
     fuzzy = ball.index(torch.arange(800).repeat(8))
     fuzzy.means = fuzzy.means + 0.05 * torch.randn(fuzzy.means.shape, generator=draw)
     fuzzy.log_scales = torch.full_like(fuzzy.log_scales, math.log(0.012))
-    MeshExporter(**SETTINGS | {"resolution": 128}).export(fuzzy, never_renders, tmp_path)
+    MeshExporter(**SETTINGS | {"resolution": 64}).export(fuzzy, never_renders, tmp_path)
     assert "exporter.mesh: the asset is fuzzy, and smoothing removes " in capsys.readouterr().err
 
 

@@ -17,6 +17,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from cadam3d.core.chart import Chart, Curve, Level
 from cadam3d.io import run_folder
 from cadam3d.io.declarations import write_declarations
+from cadam3d.report import write_sweep
 from cadam3d.report.results import JobResult, read
 from cadam3d.sweep.folder import Job, Plan, write_plan
 
@@ -185,6 +186,12 @@ def bench(tmp_path_factory) -> Path:
         "cadam", "prompt=a cube", "seed=2", "noise=strong", n=0, psnr=None, outcome="failed", message="no <b>"
     )
     return jobs.folder
+
+
+@pytest.fixture(scope="session")
+def bench_page(bench) -> Path:
+    """Return the written page of the whole comparison."""
+    return write_sweep(bench)
 
 
 @pytest.fixture(scope="session")

@@ -69,8 +69,8 @@ def measured(page: Path, folder: Path) -> tuple[float, int, float]:
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
-def test_the_page_of_a_sweep_fits_a_phone(bench, tmp_path):
-    width, texts, smallest = measured(report.write_sweep(bench), tmp_path)
+def test_the_page_of_a_sweep_fits_a_phone(bench_page, tmp_path):
+    width, texts, smallest = measured(bench_page, tmp_path)
     assert width <= PHONE
     assert texts > 50
     assert smallest >= LEGIBLE

@@ -14,8 +14,8 @@ from cadam3d.report.results import read
 
 
 @pytest.fixture(scope="module")
-def whole(bench):
-    return report.write_sweep(bench).read_text(encoding="utf-8")
+def whole(bench_page):
+    return bench_page.read_text(encoding="utf-8")
 
 
 def text_of(content: str) -> str:

@@ -122,12 +122,12 @@ def test_specks_are_removed_however_far_away_they_are():
 def test_a_fuzzy_ball_is_smoothed_to_a_ball_and_a_solid_ball_is_not():
     draw = torch.Generator().manual_seed(0)
     near = ball(0.5, 6000).means * (1 + 0.08 * torch.randn(6000, 1, generator=draw))
-    fuzzy = surface(at(near, scale=0.012), resolution=128)
+    fuzzy = surface(at(near, scale=0.012), resolution=64)
     assert fuzzy.is_smoothed
     assert fuzzy.roughness > 0.25
     assert is_watertight(fuzzy.faces)
     assert facts(fuzzy.vertices, fuzzy.faces).area < 2 * 4 * math.pi * 0.5**2
-    solid = surface(ball(0.5), resolution=128)
+    solid = surface(ball(0.5), resolution=64)
     assert not solid.is_smoothed
     assert solid.roughness < 0.05
 
