@@ -96,7 +96,7 @@ def test_a_run_leaves_everything_that_the_readme_promises(finished):
     assert set(promised.split()) <= summary.keys()
     assert summary["outcome"] == "finished"
     assert summary["prompt"] == "a red cube"
-    assert (summary["densifier"], summary["guidance"], summary["prior"]) == ("cadam", "sds", "shapes")
+    assert (summary["densifier"], summary["guidance"], summary["prior"]) == ("cadam", "sds", "world")
     assert len(read_ply(latest / "asset.ply")) == summary["num_gaussians"]
     assert (latest / "asset.ply").stat().st_size == summary["asset_bytes"]
     assert iio.imread(latest / "preview.png").ndim == 3
