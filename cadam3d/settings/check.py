@@ -91,7 +91,9 @@ def require_effective(cfg: DictConfig, command: str, overrides: Sequence[str]) -
     assert isinstance(raw, dict)
     raw.pop("hydra", None)
     if missing := [key for key, value in flatten(raw) if value == NOTHING]:
-        examples = " ".join(example_word(key) or f"{key}=..." for key in missing)
+        words = [example_word(key) for key in missing]
+        given = zip(missing, words, strict=True)
+        examples = " ".join(f"{key}=..." if word in ("", f"{key}=null") else word for key, word in given)
         raise UserError(f"{', '.join(missing)}: no value given. Try: {examples}")
     declared = declared_names(command)
     for override in overrides:
