@@ -460,21 +460,6 @@ def test_the_command_and_the_words_after_it_are_completed(line, expected, type_l
     assert complete(line, type_line, monkeypatch) == expected
 
 
-@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
-def test_bash_completes_the_command_word(tmp_path):
-    program = tmp_path / "cadam3d"
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m cadam3d "$@"\n', encoding="utf-8")
-    program.chmod(0o755)
-    script = (
-        f'eval "$({program} -sc install=bash)"\n'
-        f'COMP_LINE="{program} tr"; COMP_POINT=${{#COMP_LINE}}; COMP_CWORD=1\n'
-        "hydra_bash_completion; echo ${COMPREPLY[@]}"
-    )
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True, env=environment)
-    assert done.stdout.split() == ["train"], done.stderr
-
-
 # --- as a process ---------------------------------------------------------------------------------------
 
 
