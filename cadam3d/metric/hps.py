@@ -8,9 +8,8 @@ import torch
 
 from cadam3d.core.checks import fail
 from cadam3d.core.errors import UserError
-from cadam3d.core.memory import is_out_of_memory
 from cadam3d.core.number import Number
-from cadam3d.io.pretrained import read_tensors, short
+from cadam3d.io.pretrained import read_tensors, refused_by
 from cadam3d.metric.clip import Clip, ClipMetric, assembled, check_clip
 from cadam3d.metric.open_clip import clip_model
 from cadam3d.metric.scoring import Scorer
@@ -69,12 +68,6 @@ def _loaded(
     file: Path, base: TransformerFolder, facts: tuple[tuple[str, str | None], ...], device: torch.device
 ) -> Clip:
     """Return the model in a file. ``facts`` has the hash of the file, so a changed file is read again."""
-    try:
+    with refused_by(UserError, f"{Hps.node}.model: {file} does not fit {Hps.node}.base={base.model}"):
         model = clip_model(read_tensors(f"{Hps.node}.model", file), base.entries())
-    except (ValueError, RuntimeError, TypeError, KeyError) as error:
-        if is_out_of_memory(error):
-            raise
-        raise UserError(
-            f"{Hps.node}.model: {file} does not fit {Hps.node}.base={base.model} ({short(error)})"
-        ) from error
     return assembled(base, model, dict(facts), device)

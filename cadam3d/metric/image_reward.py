@@ -12,10 +12,9 @@ import torch
 from torch import Tensor
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.memory import is_out_of_memory
 from cadam3d.core.number import Number
 from cadam3d.io.image import to_uint8
-from cadam3d.io.pretrained import short
+from cadam3d.io.pretrained import refused_by
 from cadam3d.metric.scoring import ScoreMetric, Scorer, too_long
 from cadam3d.metric.transformer import downloaded, kept, model_facts
 
@@ -52,17 +51,9 @@ class ImageReward(ScoreMetric):
     def scorer(self, device: torch.device) -> Scorer:
         """Return the model, which gives each picture a reward."""
         package, folder = _package(), self._folder()
-        try:
+        with refused_by(self._unusable, f"the model in {folder} cannot be loaded"):
             model = kept(_loaded, package, folder, device)
             facts = model_facts(NAME, None, [folder / WEIGHTS])
-        # The package, and the libraries below it, raise almost anything.
-        except Exception as error:
-            if is_out_of_memory(error):
-                raise
-            raise UserError(
-                f"{self.node}.model: the model in {folder} cannot be loaded ({short(error)}). "
-                f"Try, with a network connection: {VOCABULARY}"
-            ) from error
         installed = next((each.version for each in distributions(name=PACKAGE)), None)
 
         def score(images: Tensor, text: str) -> Tensor:
@@ -78,6 +69,9 @@ class ImageReward(ScoreMetric):
             complaints=lambda text: too_long(len(model.blip.tokenizer(text)["input_ids"]), LONGEST),
         )
 
+    def _unusable(self, problem: str) -> UserError:
+        return UserError(f"{self.node}.model: {problem}. Try, with a network connection: {VOCABULARY}")
+
     def _folder(self) -> Path:
         """Return the folder of the model, after a download if it is on the hub and not on this disk."""
         folder = Path(self.model).expanduser()
@@ -88,14 +82,13 @@ class ImageReward(ScoreMetric):
 
 def _package() -> Any:
     """Return the package. Raises ``UserError`` if it, or something that it needs, cannot be imported."""
-    try:
-        return import_module(MODULE)
+
+    def refuse(problem: str) -> UserError:
+        return UserError(f"{ImageReward.node}: {problem}. Try, in a new environment: {INSTALL}")
+
     # A package with old requirements fails in many ways beside new libraries.
-    except Exception as error:
-        raise UserError(
-            f"{ImageReward.node}: the package {PACKAGE} cannot be imported ({short(error)}). "
-            f"Try, in a new environment: {INSTALL}"
-        ) from error
+    with refused_by(refuse, f"the package {PACKAGE} cannot be imported"):
+        return import_module(MODULE)
 
 
 def _loaded(package: Any, folder: Path, device: torch.device) -> Any:

@@ -121,8 +121,7 @@ class Janus(ClipMetric):
             images = measurand.render(one, self.protocol.backgrounds(1)).rgb.detach().float().clamp(0, 1)
             logits.append(torch.cat([self.scores(scorer, images, text) for text in texts]))
         fronts = torch.stack(logits).softmax(dim=1)[:, 0]
-        if not fronts.isfinite().all():
-            raise self.failure("it returns NaN or infinity")
+        self.require_finite(fronts)
         shown = {
             "views": self.views,
             "elevations_deg": [float(self.elevation_deg)],

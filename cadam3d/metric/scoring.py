@@ -15,9 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cadam3d.core.errors import UserError
-from cadam3d.core.memory import is_out_of_memory
 from cadam3d.core.number import Number
-from cadam3d.io.pretrained import short
+from cadam3d.io.pretrained import refused_by
 from cadam3d.metric.base import Measurand, Measurement, Metric
 from cadam3d.metric.protocol import Protocol
 from cadam3d.metric.transformer import NEEDED, TransformerFolder, find_model
@@ -62,8 +61,7 @@ class ScoreMetric(Metric):
         scorer = self.scorer(measurand.gaussians.device)
         text = self.protocol.text_of(measurand.prompt)
         values = self.values(measurand, scorer, text)
-        if not values.isfinite().all():
-            raise self.failure("it returns NaN or infinity")
+        self.require_finite(values)
         return replace(self.measurement(values, text, scorer.facts), warnings=scorer.complaints(text))
 
     def values(self, measurand: Measurand, scorer: Scorer, text: str) -> Float[Tensor, "v"]:
@@ -74,17 +72,14 @@ class ScoreMetric(Metric):
 
     def scores(self, scorer: Scorer, images: Float[Tensor, "v h w 3"], text: str) -> Float[Tensor, "v"]:
         """Return the scores of some pictures. Raises ``UserError`` if the model fails."""
-        try:
-            return scorer.score(images, text).detach().double().cpu()
         # Models and the preparation of their inputs raise almost any exception.
-        except Exception as error:
-            if is_out_of_memory(error):
-                raise
-            raise self.failure(short(error)) from error
+        with refused_by(UserError, f"metric.{self.number.name}: the model cannot score this prompt"):
+            return scorer.score(images, text).detach().double().cpu()
 
-    def failure(self, reason: str) -> UserError:
-        """Return the error for a model that cannot score an asset."""
-        return UserError(f"metric.{self.number.name}: the model cannot score this prompt ({reason})")
+    def require_finite(self, values: Tensor) -> None:
+        """Raise ``UserError`` if a model has returned NaN or infinity."""
+        if not values.isfinite().all():
+            raise UserError(f"metric.{self.number.name}: the model returns NaN or infinity for this prompt")
 
     def measurement(
         self, values: Float[Tensor, "v"], text: str | None, facts: Mapping[str, Any]
