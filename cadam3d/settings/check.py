@@ -1,8 +1,8 @@
 """Check: compare the configuration with the types that the code declares, before anything is built.
 
 A component declares the type of each of its settings, and pydantic compares, so that one check serves all
-components, those from elsewhere too. The ranges of the values belong to the constructors. A setting outside
-of all components has the type of its value in the YAML files.
+components, those from elsewhere too. The constructors check the bounds. A setting outside of all components
+has the type of its value in the YAML files, and its bounds are here.
 
 On two cores, pydantic needs about 0.1 s to load and 0.03 s for the 150 settings of a run. It is loaded when
 the first value is compared, not for a help page.

@@ -104,9 +104,8 @@ def test_images_far_larger_than_those_of_the_training_are_refused(models):
 def test_sizes_that_the_networks_cannot_read_are_refused(models):
     with pytest.raises(UserError, match=r"^camera\.size: expected a multiple of 8"):
         built("prior=shapes_sd", "prior.size=null").encode(torch.rand(1, 20, 20, 3))
-    for size in (0, 100):
-        with pytest.raises(UserError, match=r"^prior\.size: expected a multiple of 16"):
-            built("prior=shapes_sd", f"prior.size={size}")
+    with pytest.raises(UserError, match=r"^prior\.size: expected a multiple of 16"):
+        built("prior=shapes_sd", "prior.size=100")
 
 
 def test_a_model_that_is_not_in_the_package_is_named(models):

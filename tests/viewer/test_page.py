@@ -12,7 +12,6 @@ import pytest
 import torch
 from snapshots import some_gaussians
 
-from cadam3d.core.errors import UserError
 from cadam3d.exporter.html import HtmlExporter
 from cadam3d.viewer.pack import pack
 from cadam3d.viewer.page import script, style, viewer_page
@@ -119,19 +118,6 @@ def test_the_exporter_writes_one_page_with_a_title(tmp_path, title, shown):
     assert parts.texts["title"] == shown
     [options] = [json.loads(found["data-options"]) for _, found in parts.elements if "data-options" in found]
     assert options == {"camera": {"azimuth": 10.0, "elevation": -5.0}, "background": [0.25, 0.5, 1.0]}
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"azimuth_deg": float("nan")}, r"exporter\.html\.azimuth_deg"),
-        ({"elevation_deg": 91}, r"exporter\.html\.elevation_deg"),
-        ({"background": [1, 2, 3]}, r"exporter\.html\.background: expected three numbers"),
-    ],
-)
-def test_wrong_values_name_their_key(settings, message):
-    with pytest.raises(UserError, match=message):
-        exporter(**settings)
 
 
 # --- the script in Node, which needs no browser -----------------------------------------------------------
