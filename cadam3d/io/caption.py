@@ -37,8 +37,7 @@ def side_by_side(
     """Return one picture with ``pictures``, which have one size, from left to right on ``paper``.
 
     Under each is its caption, with letters that grow with the pictures. A line that is too long for its
-    picture gets smaller letters, and then ends with an ellipsis. Without captions, the pictures are joined
-    without margins.
+    picture ends with an ellipsis. Without captions, the pictures are joined without margins.
     """
     if not captions:
         return np.concatenate(pictures, axis=1)
@@ -80,8 +79,6 @@ def font(face: str, size: int) -> ImageFont.FreeTypeFont:
 def _write(image: Image.Image, text: str, top: int, face: str, size: int, color: str) -> None:
     """Write one line in the middle of ``image`` (in place), ``top`` pixels below its upper border."""
     text, room = plain(text), image.width - size // 2
-    while size > SMALLEST and font(face, size).getlength(text) > room:
-        size -= 1
     letters = font(face, size)
     if letters.getlength(text) > room:
         while text and letters.getlength(text + ELLIPSIS) > room:

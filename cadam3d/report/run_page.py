@@ -51,6 +51,9 @@ def write(folder: Path) -> Path:
     summary, metrics = read_summary(folder), read_metrics(folder)
     _, refinements = lines_of(metrics)
     video, preview, config = folder / TURNTABLE, folder / PREVIEW, folder / CONFIG
+    shown_video = TURNTABLE if video.is_file() else ""
+    if shown_video and video.stat().st_size <= EMBED_BYTES:
+        shown_video = data_url(video, "video/mp4")
     return write_page(
         folder / REPORT,
         "run.html.jinja",
@@ -59,7 +62,7 @@ def write(folder: Path) -> Path:
         components=[(name, summary[name]) for name in (*COMPONENTS, "seed") if summary.get(name) is not None],
         warnings=summary.get("warnings") or (),
         tiles=_tiles(summary),
-        video=_video_source(video) if video.is_file() else "",
+        video=shown_video,
         video_name=TURNTABLE,
         preview=data_url(preview, "image/png") if preview.is_file() else "",
         frames=frames(folder, int(number(summary.get("steps")) or 0)),
@@ -106,10 +109,6 @@ def frames(folder: Path, steps: int) -> list[tuple[int, str]]:
         if sum(len(found[step]) for step in kept) <= LARGEST:
             return [(step, encoded(found[step])) for step in kept]
     return []
-
-
-def _video_source(path: Path) -> str:
-    return data_url(path, "video/mp4") if path.stat().st_size <= EMBED_BYTES else path.name
 
 
 def _facts(summary: Mapping[str, Any]) -> list[tuple[str, Any]]:

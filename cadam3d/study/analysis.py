@@ -73,7 +73,8 @@ class ComparedPair:
     @property
     def is_certain(self) -> bool:
         """Return whether the interval excludes one half and the corrected sign test agrees."""
-        return self.rate.interval.excludes(EVEN) and self.corrected_p_value < 1 - CONFIDENCE
+        is_even = self.rate.interval.low <= EVEN <= self.rate.interval.high
+        return not is_even and self.corrected_p_value < 1 - CONFIDENCE
 
 
 @dataclass(frozen=True)

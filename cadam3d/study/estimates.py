@@ -25,10 +25,6 @@ class Interval:
     low: float
     high: float
 
-    def excludes(self, value: float) -> bool:
-        """Return whether ``value`` is outside."""
-        return not self.low <= value <= self.high
-
 
 @dataclass(frozen=True)
 class Clusters:
