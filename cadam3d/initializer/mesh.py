@@ -32,7 +32,7 @@ class Mesh(FromObject):
         Raises ``UserError`` if the file is missing, cannot be read or has no surface.
         """
         mesh = read_mesh(self.path, "initializer.path", up=f"+{self.up}", plain=self.color)
-        corners = turned_points(mesh.corners.flatten(end_dim=1), self.turn_deg)
+        corners = turned_points(mesh.corners.float().flatten(end_dim=1), self.turn_deg)
         corners = self.placed(corners)[0].view(-1, 3, 3)
         faces, weights = points_on_surface(corners, self.count, generator)
         points = (weights[..., None] * corners[faces]).sum(dim=1)

@@ -100,19 +100,27 @@ def read_gltf(path: Path) -> tuple[Any, bytes]:
     with opened(path) as file:
         content = file.read()
     try:
-        magic, version, _ = HEADER.unpack_from(content)
-        length, kind = CHUNK.unpack_from(content, HEADER.size)
-        start = HEADER.size + CHUNK.size
-        if (magic, version, kind) != (b"glTF", 2, b"JSON"):
-            raise ValueError("no glTF 2.0")
-        document = json.loads(content[start : start + length])
+        document, end = leading_document(content)
         body = b""
-        if start + length < len(content):
-            size, _ = CHUNK.unpack_from(content, start + length)
-            body = content[start + length + CHUNK.size :][:size]
+        if end < len(content):
+            size, _ = CHUNK.unpack_from(content, end)
+            body = content[end + CHUNK.size :][:size]
     except (ValueError, struct.error, RecursionError) as error:
         raise unusable(path, f"not a readable glb file ({str(error)[:100]})") from error
     return document, body
+
+
+def leading_document(content: bytes) -> tuple[Any, int]:
+    """Return the JSON document of a glb file, and the place of the byte after it.
+
+    Raises ``ValueError``, ``struct.error`` or ``RecursionError`` if there is none.
+    """
+    magic, version, _ = HEADER.unpack_from(content)
+    length, kind = CHUNK.unpack_from(content, HEADER.size)
+    start = HEADER.size + CHUNK.size
+    if (magic, version, kind) != (b"glTF", 2, b"JSON"):
+        raise ValueError("no glTF 2.0")
+    return json.loads(content[start : start + length]), start + length
 
 
 def attribute(document: Any, body: bytes, number: int) -> Float[np.ndarray, "n c"]:
