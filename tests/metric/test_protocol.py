@@ -33,7 +33,7 @@ def test_the_pictures_are_those_of_the_renderer():
 
 @pytest.mark.parametrize("text", ["no place", "{} and {}"])
 def test_a_text_has_one_place_for_the_prompt(text):
-    with pytest.raises(UserError, match=r"^RingProtocol\.text: expected a text with {} once"):
+    with pytest.raises(UserError, match=r"^Protocol\.text: expected a text with {} once"):
         replace(RING, text=text)
 
 
