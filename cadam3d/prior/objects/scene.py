@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cadam3d.core.cameras import Cameras
-from cadam3d.core.mesh.textured import TexturedMesh
+from cadam3d.core.mesh.textured import TexturedMesh, mixed
 from cadam3d.core.rendering import Triangles
 from cadam3d.io.mesh_file import read_mesh
 from cadam3d.prior.exact import Census, ExactScene
@@ -91,10 +91,11 @@ def _is_solid(mesh: TexturedMesh, hits: Hits) -> Bool[Tensor, "n"]:
 
 def _lit(mesh: TexturedMesh, fine: Cameras, view: int, hits: Hits) -> Float[Tensor, "n 3"]:
     """Return the RGB of hits in the light of the world; both sides of a face are lit as its front is."""
-    corners = mesh.corners[hits.face]
+    corners = mesh.corners.index_select(0, hits.face)
     flat = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat = flat * _side(flat, fine.positions[view] - corners[:, 0])
-    normal = (hits.weights[:, :, None] * mesh.normals[hits.face]).sum(1)
+    corner = 3 * hits.face[:, None] + torch.arange(3, device=hits.face.device)
+    normal = mixed(mesh.normals.reshape(-1, 3), corner, hits.weights)
     normal = torch.nn.functional.normalize(normal * _side(normal, flat), dim=1)
     spacing = hits.depth / fine.intrinsics[view, 0, 0]
     color = mesh.colors(hits.face, hits.weights, spacing)[:, :3]

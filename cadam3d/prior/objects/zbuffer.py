@@ -12,6 +12,7 @@ box, which keeps the cross products exact enough in float32.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import torch
@@ -21,7 +22,8 @@ from torch import Tensor
 from cadam3d.core.cameras import Cameras
 
 NEAR = 0.01  # world units, as in the rasterizers
-CHUNK = 1 << 21  # pairs of a triangle and a point that are tried together
+CHUNK = 1 << 21  # points in the boxes of triangles that are tried together
+SLACK = 0.01  # pixels, more than the rounding of the ends of a row
 
 
 @dataclass(frozen=True)
@@ -33,9 +35,9 @@ class Hits:
     weights: Float[Tensor, "n 3"]  # barycentric
     depth: Float[Tensor, "n"]  # along the axis of the camera, in world units
 
-    def where(self, chosen: Tensor) -> "Hits":
+    def where(self, chosen: Int[Tensor, "m"]) -> "Hits":
         """Return the chosen rows."""
-        return Hits(self.point[chosen], self.face[chosen], self.weights[chosen], self.depth[chosen])
+        return Hits(*(getattr(self, name).index_select(0, chosen) for name in Hits.__dataclass_fields__))
 
 
 def first_hits(
@@ -48,25 +50,25 @@ def first_hits(
 
     ``is_solid`` says which hits are no holes; None means all. Both sides of a triangle are seen.
     """
-    to_camera = fine.world_to_camera[view]
-    homogeneous = (corners @ to_camera[:3, :3].T + to_camera[:3, 3]) @ fine.intrinsics[view].T
-    face, low, size = _boxes(homogeneous, fine.width, fine.height)
-    homogeneous = homogeneous[face]
-    homogeneous = homogeneous - homogeneous[:, :, 2:] * torch.nn.functional.pad(low, (0, 1))[:, None]
-    a, b, c = homogeneous.unbind(1)
-    edges = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=1)
-    volume = (a * edges[:, 0]).sum(1)
-    edges = edges * volume.sign()[:, None, None]
-    ends = (size[:, 0] * size[:, 1]).cumsum(0)
+    to_pixels = fine.intrinsics[view] @ fine.world_to_camera[view, :3]
+    homogeneous = to_pixels[:, :3] @ corners.reshape(-1, 3).T + to_pixels[:, 3:]
+    face, low, size = _boxes(homogeneous.reshape(3, -1, 3), fine.width, fine.height)
+    kept = homogeneous.reshape(3, -1, 3).index_select(1, face)
+    a, b, c = (kept - torch.nn.functional.pad(low, (0, 0, 0, 1))[:, :, None] * kept[2]).unbind(2)
+    cross = partial(torch.linalg.cross, dim=0)
+    edges = torch.stack([cross(b, c), cross(c, a), cross(a, b)], dim=1)
+    volume = (a * edges[:, 0]).sum(0)
+    edges = edges * volume.sign()
     found = []
-    for rows in _chunks(ends):
-        found.append(_inside(edges[rows], volume[rows].abs(), low[rows], size[rows], face[rows], fine.width))
+    for rows in _chunks((size[0] * size[1]).cumsum(0)):
+        part = (edges[:, :, rows], volume[rows].abs(), low[:, rows], size[:, rows], face[rows])
+        found.append(_inside(*part, fine.width))
     hits = Hits(*(torch.cat([getattr(part, name) for part in found]) for name in Hits.__dataclass_fields__))
     if is_solid is not None:
-        hits = hits.where(is_solid(hits))
+        hits = hits.where(is_solid(hits).nonzero()[:, 0])
     nearest = hits.depth.new_full((fine.width * fine.height,), torch.inf)
     nearest.scatter_reduce_(0, hits.point, hits.depth, "amin")
-    hits = hits.where(hits.depth <= nearest[hits.point])
+    hits = hits.where((hits.depth <= nearest[hits.point]).nonzero()[:, 0])
     # Of two triangles at the same depth, such as at a common edge, the later one is seen.
     winner = torch.full_like(nearest, -1, dtype=torch.long)
     winner.scatter_reduce_(0, hits.point, torch.arange(len(hits.point), device=winner.device), "amax")
@@ -74,20 +76,19 @@ def first_hits(
 
 
 def _boxes(
-    homogeneous: Float[Tensor, "f 3 3"], width: int, height: int
-) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 2"], Int[Tensor, "n 2"]]:
+    homogeneous: Float[Tensor, "3 f 3"], width: int, height: int
+) -> tuple[Int[Tensor, "n"], Float[Tensor, "2 n"], Int[Tensor, "2 n"]]:
     """Return the triangles that may cover a pixel centre, the first one of each and how many in x and y."""
-    depth = homogeneous[:, :, 2]
-    is_before = depth > NEAR
-    flat = homogeneous[:, :, :2] / depth[:, :, None].clamp_min(NEAR)
-    most = torch.tensor([width, height], device=depth.device)
-    first = (flat.amin(1) - 0.5).ceil().clamp_min(0)
-    last = torch.minimum((flat.amax(1) - 0.5).floor(), most - 1)
-    is_cut = ~is_before.all(1)
-    first[is_cut], last[is_cut] = 0, (most - 1).to(last)
-    size = (last - first + 1).clamp_min(0).long()
-    face = ((size.prod(1) > 0) & is_before.any(1)).nonzero()[:, 0]
-    return face, first[face] + 0.5, size[face]
+    depth = homogeneous[2:]
+    a, b, c = torch.cat([homogeneous[:2] / depth.clamp_min(NEAR), depth]).unbind(2)
+    least, most = torch.minimum(torch.minimum(a, b), c), torch.maximum(torch.maximum(a, b), c)
+    limits = least.new_tensor([[width - 1], [height - 1]])
+    is_cut = least[2] <= NEAR
+    first = (least[:2] - 0.5).ceil().clamp_min(0).masked_fill(is_cut, 0)
+    last = torch.where(is_cut, limits, torch.minimum((most[:2] - 0.5).floor(), limits))
+    size = (last - first + 1).clamp_min(0)
+    face = ((size[0] * size[1] > 0) & (most[2] > NEAR)).nonzero()[:, 0]
+    return face, first.index_select(1, face) + 0.5, size.index_select(1, face).long()
 
 
 def _chunks(ends: Int[Tensor, "n"]) -> list[slice]:
@@ -99,25 +100,39 @@ def _chunks(ends: Int[Tensor, "n"]) -> list[slice]:
 
 
 def _inside(
-    edges: Float[Tensor, "n 3 3"],
+    edges: Float[Tensor, "3 3 n"],
     volume: Float[Tensor, "n"],
-    low: Float[Tensor, "n 2"],
-    size: Int[Tensor, "n 2"],
+    low: Float[Tensor, "2 n"],
+    size: Int[Tensor, "2 n"],
     face: Int[Tensor, "n"],
     width: int,
 ) -> Hits:
     """Return all pixel centres inside of triangles, also those that another triangle hides."""
-    count = size[:, 0] * size[:, 1]
-    row = torch.arange(len(count), device=count.device).repeat_interleave(count)
-    number = torch.arange(len(row), device=row.device) - (count.cumsum(0) - count)[row]
-    down = torch.div(number, size[row, 0], rounding_mode="floor")
-    across = number - down * size[row, 0]
-    x, y = across.to(low), down.to(low)
-    shares = edges[row, :, 0] * x[:, None] + edges[row, :, 1] * y[:, None] + edges[row, :, 2]
-    total = shares.sum(1)
-    inside = ((shares >= 0).all(1) & (total > 0)).nonzero()[:, 0]
-    row, shares, total = row[inside], shares[inside], total[inside]
-    corner = low[row].long()
-    point = (corner[:, 1] + down[inside]) * width + corner[:, 0] + across[inside]
-    hits = Hits(point, face[row], shares / total[:, None], volume[row] / total)
-    return hits.where((hits.depth > NEAR).nonzero()[:, 0])
+    # First the rows of each triangle, and where e_i = level + slope x changes its sign in them.
+    owner, y = _repeated(size[1])
+    slope, down, level = (each.index_select(1, owner) for each in edges)
+    level = level + down * y
+    crossing = -level / slope
+    first = torch.where(slope > 0, crossing, 0).amax(0)
+    last = torch.where(slope < 0, crossing, torch.inf).amin(0)
+    first = (first - SLACK).ceil().clamp_min(0)
+    last = torch.minimum((last + SLACK).floor(), size[0].index_select(0, owner) - 1)
+    row, x = _repeated((last - first + 1).clamp_min(0).long())
+    x = x + first.index_select(0, row)
+    shares = level.index_select(1, row) + slope.index_select(1, row) * x
+    total = shares.sum(0)
+    owner = owner.index_select(0, row)
+    # The depth is volume / total.
+    is_inside = (shares.amin(0) >= 0) & (total > 0) & (volume.index_select(0, owner) > NEAR * total)
+    inside = is_inside.nonzero()[:, 0]
+    owner, total = owner[inside], total[inside]
+    left, upper = low.index_select(1, owner).long()
+    point = (upper + y[row[inside]]) * width + left + x[inside].long()
+    return Hits(point, face[owner], (shares.index_select(1, inside) / total).T, volume[owner] / total)
+
+
+def _repeated(count: Int[Tensor, "n"]) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]]:
+    """Return each number ``count`` times, and how often it was there before."""
+    number = torch.arange(len(count), device=count.device).repeat_interleave(count)
+    first = count.cumsum(0) - count
+    return number, torch.arange(len(number), device=count.device) - first.index_select(0, number)
