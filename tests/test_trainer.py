@@ -22,7 +22,7 @@ CPU = torch.device("cpu")
 SMALL = [
     "prompt=a red cube",
     "prior=tiny",
-    "rasterizer=reference",
+    "rasterizer=auto",
     "steps=8",
     "camera.size=16",
     "initializer.count=30",
@@ -374,7 +374,7 @@ def test_losing_every_gaussian_is_an_outcome(tmp_path):
     [torch.OutOfMemoryError("no"), RuntimeError("DefaultCPUAllocator: can't allocate memory: 9 bytes")],
 )
 def test_running_out_of_memory_is_an_outcome(tmp_path, error, monkeypatch):
-    trainer, state = make()
+    trainer, state = make(["rasterizer=reference"])
 
     def exhausted(*_args):
         raise error
@@ -431,7 +431,7 @@ def test_a_loop_that_raises_calls_on_abort(tmp_path, monkeypatch):
         def on_abort(self, context: RunContext) -> None:
             self.was_called = True
 
-    trainer, state = make()
+    trainer, state = make(["rasterizer=reference"])
     holder = Holder()
     monkeypatch.setattr(type(trainer.rasterizer), "render", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
