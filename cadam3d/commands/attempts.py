@@ -9,8 +9,8 @@ from cadam3d import report
 from cadam3d.core.console import complain, show
 from cadam3d.core.errors import UserError
 from cadam3d.core.number import preferred
-from cadam3d.io.atomic import link
 from cadam3d.io.jsonl import write_json
+from cadam3d.io.links import link
 from cadam3d.io.run_folder import ASSET, BEST, CHOICE, LATEST, REPORT, setting_word, shown
 from cadam3d.settings.line import Line
 from cadam3d.sweep.choice import (

@@ -11,7 +11,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from cadam3d.commands.messages import note, note_backend
 from cadam3d.core.console import visible
-from cadam3d.io.atomic import link, remove_leftovers, replacing
+from cadam3d.io.atomic import remove_leftovers, replacing
+from cadam3d.io.links import link
 from cadam3d.io.lock import INHERITED
 from cadam3d.io.run_folder import CONFIG, HYDRA_CONFIG, HYDRA_SETTINGS, LATEST, LOG, OVERRIDES
 from cadam3d.rasterizer.base import Backend

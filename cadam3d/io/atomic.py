@@ -1,13 +1,11 @@
 """Atomic writes: a file is written under another name and then renamed, so it appears whole or not at all."""
 
-import logging
 import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
 
 TEMPORARY = ".tmp-"  # in the name of every file that is still being written
@@ -73,24 +71,6 @@ def remove_leftovers(folder: Path) -> None:
             shutil.rmtree(leftover, ignore_errors=True)
         else:
             leftover.unlink(missing_ok=True)
-
-
-def link(name: Path, folder: Path) -> None:
-    """Make ``name`` a link to ``folder``, in one step. If that is not possible, print a note.
-
-    The link is relative if ``folder`` is beside it or deeper, so that both can be moved together.
-    """
-    temporary = name.with_name(f"{TEMPORARY}{os.getpid()}-{name.name}")
-    try:
-        name.parent.mkdir(parents=True, exist_ok=True)
-        target, base = folder.resolve(), name.parent.resolve()
-        if os.path.lexists(name) and not name.is_symlink():
-            raise FileExistsError(0, "it exists and is not a link")
-        temporary.unlink(missing_ok=True)
-        temporary.symlink_to(target.relative_to(base) if target.is_relative_to(base) else target)
-        temporary.replace(name)
-    except OSError as error:
-        say(f"Note: {name} not updated ({error.strerror}).", logging.WARNING)
 
 
 def _unwritable(path: Path, error: OSError) -> UserError:

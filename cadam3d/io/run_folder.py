@@ -12,6 +12,7 @@ from pathlib import Path
 
 from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
+from cadam3d.io.links import followed
 
 # Written by training.
 ASSET = "asset.ply"
@@ -241,7 +242,7 @@ def setting_word(key: str, value: object) -> str:
 def expanded(text: str) -> Path:
     """Return the path that a user has typed, with the home folder in place of ``~``."""
     try:
-        return Path(text).expanduser()
+        return followed(Path(text).expanduser())
     # There is no such user, or no file can have or show this name.
     except (RuntimeError, OSError, ValueError):
         return Path(text)

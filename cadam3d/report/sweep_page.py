@@ -17,7 +17,7 @@ from cadam3d.io.run_folder import CHOICE, FIGURES, REPORT, TABLE
 from cadam3d.report import figures, strips, tables
 from cadam3d.report.pages import table, write_page
 from cadam3d.report.paper_formats import FORMATS, read_table
-from cadam3d.report.results import PROMPT, JobResult, measured, read
+from cadam3d.report.results import NOISE, PROMPT, JobResult, measured, objective_axis, read
 from cadam3d.report.score_maps import declared_scores, score_figure
 from cadam3d.report.style import inline, styled, write_figure
 from cadam3d.settings.line import key_of
@@ -34,20 +34,49 @@ class FigureKind:
     draw: Callable[[Results], Figure | None]  # None: the results have no data for it
     title: str
     caption: str
+    # More sentences of the caption, each with the question whether the figure of these results has that.
+    details: Sequence[tuple[Callable[[Results], bool], str]] = ()
+
+    def described(self, results: Results) -> str:
+        """Return the caption of the figure of these results."""
+        shown = measured(results)
+        return " ".join([self.caption, *(text for is_drawn, text in self.details if is_drawn(shown))])
 
 
-FRONTIER = (
-    "Up and to the left is better. Each mark is the median of one setting over its cells, and bars hold the "
-    "middle half of the cells. The standard setting is ringed. A dagger means that jobs ended early."
+def _has_cells(results: Results) -> bool:
+    return len({result.cell.without(NOISE) for result in results}) > 1
+
+
+def _has_labels(results: Results) -> bool:
+    return any(len(result.setting.thresholds) == 1 for result in results)
+
+
+def _has_standard(results: Results) -> bool:
+    return any(result.is_standard and result.setting.thresholds for result in results)
+
+
+def _has_objectives(results: Results) -> bool:
+    return len({result.cell[objective_axis(results)] for result in results}) > 1
+
+
+FRONTIER = "Up and to the left is better. Each mark is one setting."
+FRONTIER_DETAILS = (
+    (_has_cells, "It is the median over cells, and bars hold the middle half of the cells."),
+    (_has_labels, "An arm with one threshold has it beside each mark."),
+    (_has_standard, "The standard setting is ringed."),
+    (lambda results: any(result.ended_early for result in results), "A dagger means that jobs ended early."),
 )
 # The figures of every sweep. A sweep also has declared scores, and a grid may name "frontier_NAME",
 # the frontier of any other number.
 KINDS = {
-    "frontier": FigureKind(figures.frontier_figure, "Quality against count", FRONTIER),
+    "frontier": FigureKind(
+        figures.frontier_figure, "Quality against count", FRONTIER, details=FRONTIER_DETAILS
+    ),
     "growth": FigureKind(
         figures.growth_figure,
         "Gaussians over time",
-        "Medians over cells; the shaded areas hold the middle half of the cells.",
+        "An arm that stops growing on its own levels off; an arm that does not keeps climbing.",
+        details=[(_has_cells, "Medians over cells; the shaded areas hold the middle half of the cells.")],
     ),
     "masks": FigureKind(
         strips.masks_figure,
@@ -58,16 +87,19 @@ KINDS = {
     "thresholds": FigureKind(
         figures.thresholds_figure,
         "Two thresholds",
-        "Median count and quality by two thresholds of one arm. The standard setting is bold.",
+        "How the count and the quality depend on two thresholds of one arm.",
+        details=[(_has_cells, "Medians over cells."), (_has_standard, "The standard setting is bold.")],
     ),
     "assets": FigureKind(
         strips.assets_figure,
         "Arms side by side",
-        "One scene from the same start, with the final count and quality. A row is an objective.",
+        "One scene from the same start, with the final count and quality.",
+        details=[(_has_objectives, "Columns are arms, and rows are objectives.")],
     ),
 }
 LONGEST_PROMPTS = 120  # characters, in the title of a page
-SCORE_CAPTION = "Darker cells hold more Gaussians; dashed lines are values to compare with."
+SCORE_CAPTION = "Darker cells hold more Gaussians."
+LEVELS_CAPTION = "The dashed lines are values to compare with."
 
 
 def write(sweep_folder: Path, baseline: str | None = None) -> Path:
@@ -104,7 +136,7 @@ def write(sweep_folder: Path, baseline: str | None = None) -> Path:
         comparison=table(tables.shown_comparison(comparison, results), align_decimals=True),
         paper=read_table(sweep_folder),
         medians=table(medians, align_decimals=True),
-        figures=[(kind.title, kind.caption, svg) for kind, svg in drawn if svg],
+        figures=[(kind.title, kind.described(results), svg) for kind, svg in drawn if svg],
         early=[each for each in results if each.outcome != Outcome.FINISHED and not each.is_unfinished],
         waiting=sum(result.is_unfinished for result in results),
         jobs=table(jobs, align_decimals=True),
@@ -127,7 +159,7 @@ def _scores(results: Results) -> dict[str, FigureKind]:
         score: FigureKind(
             partial(score_figure, chart=chart),
             chart.title,
-            f"{chart.caption} {SCORE_CAPTION}",
+            " ".join([chart.caption, SCORE_CAPTION, *([LEVELS_CAPTION] if chart.levels else [])]),
         )
         for score, chart in declared_scores(results).items()
         if score not in KINDS
@@ -145,6 +177,7 @@ def _frontiers(results: Results) -> dict[str, FigureKind]:
             partial(figures.frontier_figure, quality=each),
             f"{each.fact} against count",
             FRONTIER,
+            details=FRONTIER_DETAILS,
         )
         for each in numbers
     }

@@ -3,7 +3,7 @@
 import pytest
 
 from cadam3d.core.errors import UserError
-from cadam3d.io.atomic import link, remove_leftovers, replacing
+from cadam3d.io.atomic import remove_leftovers, replacing
 
 
 def test_the_file_appears_only_when_the_block_has_succeeded(tmp_path):
@@ -58,19 +58,3 @@ def test_leftovers_are_removed_and_nothing_else(tmp_path):
         (tmp_path / name).touch()
     remove_leftovers(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".hidden", "a.pt"]
-
-
-def test_a_link_leads_to_the_newest_folder_and_moves_with_it(tmp_path):
-    for name in ("one", "two"):
-        (tmp_path / "outputs" / name).mkdir(parents=True)
-        link(tmp_path / "outputs/latest", tmp_path / "outputs" / name)
-    (tmp_path / "outputs").rename(tmp_path / "moved")
-    assert (tmp_path / "moved/latest").resolve() == tmp_path / "moved/two"
-    assert {path.name for path in (tmp_path / "moved").iterdir()} == {"one", "two", "latest"}
-
-
-def test_a_link_never_replaces_a_file(tmp_path, capsys):
-    (tmp_path / "latest").write_text("mine")
-    link(tmp_path / "latest", tmp_path)
-    assert (tmp_path / "latest").read_text() == "mine"
-    assert "not updated (it exists and is not a link)" in capsys.readouterr().err

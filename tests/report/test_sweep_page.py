@@ -58,6 +58,25 @@ def test_ids_are_not_shared_between_figures(whole):
     assert len(ids) == len(set(ids)) > 0
 
 
+OF_CELLS = ("bars hold the middle half", "shaded areas", "Medians over cells")
+OF_SETTINGS = ("it beside each mark", "standard setting is ringed", "A dagger")
+
+
+def test_captions_describe_only_what_is_drawn(whole, jobs):
+    for each in (*OF_CELLS, *OF_SETTINGS[:2]):
+        assert each in text_of(whole)
+    for arm in ("cadam", "baseline"):
+        jobs.files(jobs.add(arm, n=1000, psnr=20.0), 1000)
+    small = text_of(report.write_sweep(jobs.folder).read_text(encoding="utf-8"))
+    assert "Each mark is one setting." in small
+    for each in (*OF_CELLS, *OF_SETTINGS, "rows are objectives", "standard setting"):
+        assert each not in small
+    jobs.add("baseline", "densifier.tau_pos=0.001", n=500, psnr=19.0, outcome="max_gaussians")
+    more = text_of(report.write_sweep(jobs.folder).read_text(encoding="utf-8"))
+    for each in OF_SETTINGS:
+        assert each in more
+
+
 def test_an_unfinished_sweep_has_a_page_too(jobs):
     folder = jobs.add("cadam", n=100, psnr=20.0)
     jobs.add("baseline", n=1000, psnr=20.5)
