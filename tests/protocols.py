@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from cadam3d.core.rendering import RenderOutput
-from cadam3d.metric.protocol import Protocol
+from cadam3d.metric.protocol import RingProtocol
 
 
-def ring(**changes: Any) -> Protocol:
+def ring(**changes: Any) -> RingProtocol:
     """Return a ring of three views on white, of which the mean counts, with some other settings."""
     settings: dict[str, Any] = {
         "name": "small",
@@ -22,7 +22,7 @@ def ring(**changes: Any) -> Protocol:
         "text": "{}",
         "models": {},
     }
-    return Protocol(**settings | changes)
+    return RingProtocol(**settings | changes)
 
 
 def output(rgb: Tensor, alpha: Tensor | None = None) -> RenderOutput:

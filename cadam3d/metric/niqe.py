@@ -58,7 +58,8 @@ class Niqe(ScoreMetric):
     def measure(self, measurand: Measurand) -> Measurement:
         """Return ``niqe`` with its record; nothing if no view has two blocks with texture.
 
-        Views with fewer such blocks are left out of the mean, and the record counts them.
+        Views with fewer such blocks are left out of the mean, and the record counts them. If the protocol
+        aggregates in another way, one such view leaves no number.
         """
         if len(measurand.gaussians) == 0:
             return Measurement({})
@@ -68,7 +69,8 @@ class Niqe(ScoreMetric):
         lost = len(values) - len(known)
         missing = (f"{lost} of {len(values)} views are left out, because they show no texture",)
         warnings = missing if lost else ()
-        if len(known) == 0:
+        # A number other than the mean may need every view.
+        if len(known) == 0 or (lost and not self.protocol.is_mean):
             return Measurement({}, warnings=warnings)
         facts = {**scorer.facts, "views_left_out": lost}
         return replace(self.measurement(known, None, facts), warnings=warnings)

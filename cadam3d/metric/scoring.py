@@ -85,15 +85,15 @@ class ScoreMetric(Metric):
         self, values: Float[Tensor, "v"], text: str | None, facts: Mapping[str, Any]
     ) -> Measurement:
         """Return the number that the values of all views become, with its record."""
-        value = float(values.mean())
+        value = self.protocol.aggregate(values, less_is_better=not self.number.is_more_better)
         record = {
             "value": value,
             "protocol": self.protocol.record(),
             **facts,
             "text": text,
             "views": [float(each) for each in values],
-            "mean": value,
-            "interval": self.interval(values),
+            "mean": float(values.mean()),
+            "interval": self.interval(values) if self.protocol.is_mean else None,
         }
         return Measurement({self.number.name: value}, {self.number.name: record})
 

@@ -225,7 +225,7 @@ def test_columns_are_the_numbers_that_every_row_has(jobs):
 @pytest.mark.parametrize(
     "other",
     [
-        scored(30, {"name": "mine", "views": 12}),
+        scored(30, {"name": "t3bench", "views": 12}),
         scored(30, {**PROTOCOL, "views": 8}),
         scored(30, sha="bb"),
         {"clip_score": 30.0, "measurements": {}},
@@ -249,7 +249,7 @@ def test_scores_of_one_table_belong_to_one_protocol(jobs):
     for arm in ("baseline", "cadam"):
         both = scored(30.0)
         both["niqe"] = 5.0
-        both["measurements"]["niqe"] = {"protocol": {"name": "mine", "views": 12}, "weights_sha256": "cc"}
+        both["measurements"]["niqe"] = {"protocol": {"name": "t3bench", "views": 12}, "weights_sha256": "cc"}
         jobs.add(arm, n=100, psnr=20, arm=arm, **both)
     table = table_of(jobs.folder)
     assert "clip_score" in [number.name for number in table.numbers]
@@ -267,11 +267,11 @@ def test_settings_that_come_with_prompts_do_not_split_the_rows(jobs):
 def test_eval_replaces_the_numbers_of_training(jobs):
     jobs.paper_table = True
     folder = jobs.add("cadam", n=10, psnr=20, arm="cadam", **scored(30.0))
-    evaluation = declared({"num_gaussians": 10, **scored(25.0, {"name": "mine"})})
+    evaluation = declared({"num_gaussians": 10, **scored(25.0, {"name": "t3bench"})})
     (folder / run_folder.EVALUATION).write_text(json.dumps(evaluation))
     table = table_of(jobs.folder)
     assert cell_of(table, row_of(table, "SDS", "cadam"), "clip_score")[0] == "25.00"
-    assert any("protocol=mine" in note for note in table.notes)
+    assert any("protocol=t3bench" in note for note in table.notes)
     # An evaluation of another asset does not count.
     (folder / run_folder.EVALUATION).write_text(json.dumps({**evaluation, "num_gaussians": 11}))
     table = table_of(jobs.folder)

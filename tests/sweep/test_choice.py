@@ -233,7 +233,7 @@ def test_attempts_without_the_number_are_kept_and_the_message_says_how_to_measur
 
 def test_numbers_that_were_measured_in_different_ways_are_not_compared(train):
     train("prompt=an attempt", "attempts=2")
-    for seed, protocol in enumerate(("paper", "mine")):
+    for seed, protocol in enumerate(("paper", "t3bench")):
         number = {"num_gaussians": 5, "clip_score": 30.0 + seed}
         number["measurements"] = {"clip_score": {"protocol": {"name": protocol}}}
         (only_folder() / f"seed={seed}" / "eval.json").write_text(json.dumps(declared(number)))
