@@ -139,6 +139,12 @@ def milliseconds(work: Callable[[], object], device: Any, times: int = 1) -> flo
     return 1e3 * (clock() - begin) / times
 
 
+def peak_bytes() -> int:
+    """Return the largest memory of this process so far, which Linux counts in KiB."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
+
+
 # --- the machine and the results --------------------------------------------------------------------------
 
 

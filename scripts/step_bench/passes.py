@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
+from measuring import peak_bytes
 from step_bench.clocks import ORDER, Watch, clocks_around_functions, replaced, split, timed
 
 COUNTED_STEPS = 3
@@ -56,7 +57,7 @@ def three_passes(run: Run, args: argparse.Namespace) -> dict[str, Any]:
 
 
 def time_whole(run: Run, args: argparse.Namespace, device: Any) -> dict[str, Any]:
-    """Return the milliseconds of untouched steps, and the peak of the memory in bytes on CUDA."""
+    """Return the milliseconds of untouched steps, and the peak of the memory in bytes."""
     import torch
 
     marks = []
@@ -78,7 +79,7 @@ def time_whole(run: Run, args: argparse.Namespace, device: Any) -> dict[str, Any
         # On CUDA the host may be ahead of the device in one step and wait for it in the next.
         "wall_ms": 1e3 * (statistics.fmean(walls) if device.type == "cuda" else statistics.median(walls)),
         "cpu_ms": 1e3 * statistics.median(cpus),
-        "peak_bytes": torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None,
+        "peak_bytes": torch.cuda.max_memory_allocated(device) if device.type == "cuda" else peak_bytes(),
     }
 
 
