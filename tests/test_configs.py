@@ -309,7 +309,7 @@ RUN_ELSEWHERE = RECIPES | {"smoke"}  # test_end_to_end.py trains it
 @pytest.mark.parametrize("experiment", sorted(set(EXPERIMENTS) - RUN_ELSEWHERE))
 def test_every_experiment_runs_two_steps_on_the_tiny_prior(experiment, tmp_path, monkeypatch):
     raw = read(CONFIGS / "experiment" / f"{experiment}.yaml")
-    lines = [PROMPT, f"experiment={experiment}", "prior=tiny", "rasterizer=reference", "steps=2"]
+    lines = [PROMPT, f"experiment={experiment}", "prior=tiny", "rasterizer=auto", "steps=2"]
     lines += ["camera.size=16", "initializer.count=20", f"hydra.run.dir={tmp_path}"]
     lines += [line for line in ("exporter=[ply]", "metric=[size]") if line.partition("=")[0] not in raw]
     monkeypatch.chdir(tmp_path)

@@ -41,7 +41,7 @@ def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 def test_a_sweep_and_its_workers_and_jobs_ignore_the_modules_of_the_current_folder(folder):
     small = ["steps=1", "initializer.count=10", "camera.size=8", "exporter=[]", "metric=[]", "callback=[]"]
-    words = ["prompt=a red cube", "seed=0,1", "rasterizer=reference", *small, "hydra.sweep.dir=sweep"]
+    words = ["prompt=a red cube", "seed=0,1", "rasterizer=auto", *small, "hydra.sweep.dir=sweep"]
     launcher = ["launcher=joblib", "launcher.n_jobs=2"]
     # The first option is how the installed script cadam3d starts.
     run(folder, "-P", "-m", "cadam3d", "sweep", *words, *launcher)

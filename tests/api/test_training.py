@@ -22,7 +22,7 @@ from cadam3d.api.guest import literal
 from cadam3d.settings.line import quoted, text_of
 from cadam3d.state import RunContext, StepReport, TrainState
 
-SMALL = ("prior=tiny", "rasterizer=reference", "steps=4", "views=1", "camera.size=8", "initializer.count=20")
+SMALL = ("prior=tiny", "rasterizer=auto", "steps=4", "views=1", "camera.size=8", "initializer.count=20")
 SMALL += ("refine.start=0", "refine.end=9", "refine.interval=2", "densifier.min_age=0", "seed=3")
 SMALL += ("exporter=[ply]", "metric=[size]", "callback=[checkpoint,metrics]", "callback.checkpoint.every=1")
 NASTY = "it's 50% of \"a, cube\" = [red], {x: $HOME} ${seed} \\' 🎈"

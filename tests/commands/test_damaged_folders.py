@@ -31,7 +31,7 @@ from cadam3d.settings.trust import read_overrides
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
 
 SECONDS = 60  # that a command may take on a busy machine
-TINY = ["prompt=a red cube", "prior=tiny", "rasterizer=reference", "camera.size=8", "steps=4", "views=1"]
+TINY = ["prompt=a red cube", "prior=tiny", "rasterizer=auto", "camera.size=8", "steps=4", "views=1"]
 TINY += ["initializer.count=7", "metric=[size]", "callback=[checkpoint,metrics,candidates]"]
 TINY += ["callback.checkpoint.every=2", "callback.candidates.every=1", "callback.candidates.size=8"]
 TINY += ["refine.start=0", "refine.end=4", "refine.interval=2", "exporter=[ply]", "hydra.run.dir=run"]

@@ -36,7 +36,7 @@ SUMMARY |= {"prior": "shapes", "cadam3d": "0.0.1", "torch": "2.9"}
 def run_folder(tmp_path) -> Path:
     folder = tmp_path / "a run"
     folder.mkdir()
-    settings = as_yaml("prompt=a red cube", "rasterizer=reference")
+    settings = as_yaml("prompt=a red cube", "rasterizer=auto")
     (folder / "config.yaml").write_text(settings, encoding="utf-8")
     write_ply(folder / "asset.ply", make_gaussians(6, degree=1), up="-y", pad_sh=0)
     write_json(folder / "summary.json", SUMMARY)
@@ -390,7 +390,7 @@ def test_another_format_beside_an_asset_costs_the_asset_nothing(type_line, tmp_p
         "exporter=[images]",
         "exporter.images.views=1",
         "exporter.images.size=16",
-        "rasterizer=reference",
+        "rasterizer=auto",
     ]
     done = type_line(command, f"ply=asset.{kind}", *(words if command == "render" else []))
     assert done.code == 0

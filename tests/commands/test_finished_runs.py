@@ -35,7 +35,7 @@ def gaussians() -> Gaussians:
 
 def make_run(folder: Path, gaussians: Gaussians, *overrides: str) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
-    settings = as_yaml("prompt=a red cube", "rasterizer=reference", *overrides)
+    settings = as_yaml("prompt=a red cube", "rasterizer=auto", *overrides)
     (folder / "config.yaml").write_text(settings, encoding="utf-8")
     write_ply(folder / "asset.ply", gaussians, up="-y", pad_sh=0)
     return folder

@@ -32,7 +32,7 @@ def clip(models):
 
 def make_run(folder: Path) -> Path:
     folder.mkdir(parents=True)
-    (folder / "config.yaml").write_text(as_yaml("prompt=a red cube", "rasterizer=reference"), "utf-8")
+    (folder / "config.yaml").write_text(as_yaml("prompt=a red cube", "rasterizer=auto"), "utf-8")
     write_ply(folder / "asset.ply", make_gaussians(6, spread=0.3), up="-y", pad_sh=0)
     write_json(folder / "summary.json", {"num_gaussians": 6, "outcome": "finished", "prompt": "a red cube"})
     return folder
@@ -89,7 +89,7 @@ def test_an_evaluation_keeps_what_others_have_measured(tmp_path, type_line, clip
 
 
 def test_training_measures_scores_too(tmp_path, type_line, clip):
-    fast = ("steps=2", "camera.size=8", "rasterizer=reference", "exporter=[]", "callback=[]")
+    fast = ("steps=2", "camera.size=8", "rasterizer=auto", "exporter=[]", "callback=[]")
     line = ("train", "prompt=a red cube", "hydra.run.dir=run", "metric=[clip_score]", "initializer.count=20")
     assert type_line(*line, *fast, clip, *SMALL).code == 0
     summary = read_json(tmp_path / "run/summary.json")

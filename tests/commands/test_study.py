@@ -14,7 +14,7 @@ from cadam3d.study.questions import QUESTION_NAMES
 
 ARMS = ("heron", "ibis")
 PROMPTS = ("a cube", "a cone", 'a <b>torus</b> & "co"</script>')
-SMALL = ("size=16", "frames=2", "rasterizer=reference", "catch_share=0.5")
+SMALL = ("size=16", "frames=2", "rasterizer=auto", "catch_share=0.5")
 
 
 def make_run(folder: Path, arm: str, prompt: str, seed=0, count=8) -> Path:

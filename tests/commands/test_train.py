@@ -9,7 +9,7 @@ import pytest
 from cadam3d import cli
 from cadam3d.io.ply import read_ply
 
-SMALL = ["prompt=a red cube", "prior=tiny", "rasterizer=reference", "camera.size=8", "steps=1", "views=1"]
+SMALL = ["prompt=a red cube", "prior=tiny", "rasterizer=auto", "camera.size=8", "steps=1", "views=1"]
 SMALL += ["initializer.count=7", "metric=[size]", "callback=[]"]
 PREVIEW = ["exporter.preview.size=8", "exporter.preview.views=1", "exporter.preview.labels=false"]
 

@@ -14,7 +14,7 @@ from cadam3d.sweep.folder import Job, Plan, write_plan
 
 EYES = ["metric.fidelity.views=2", "metric.fidelity.elevations_deg=[0]", "metric.fidelity.size=24"]
 EYES += ["metric.outline.views=2", "metric.outline.elevations_deg=[0]", "metric.outline.size=24"]
-SMALL = ["prompt=a red mug", "prior=tiny", "rasterizer=reference", "camera.size=8", "views=1", *EYES]
+SMALL = ["prompt=a red mug", "prior=tiny", "rasterizer=auto", "camera.size=8", "views=1", *EYES]
 SMALL += [
     "initializer.count=7",
     "initializer.opacity=0.9",
@@ -39,7 +39,7 @@ def quality(file: Path) -> dict[str, float]:
 
 def make_run(folder: Path, *overrides: str) -> Path:
     folder.mkdir(parents=True)
-    settings = as_yaml("prompt=a red mug", "rasterizer=reference", "initializer.count=7", *overrides)
+    settings = as_yaml("prompt=a red mug", "rasterizer=auto", "initializer.count=7", *overrides)
     (folder / "config.yaml").write_text(settings, encoding="utf-8")
     write_ply(folder / "asset.ply", make_gaussians(6, spread=0.3), up="-y", pad_sh=0)
     return folder

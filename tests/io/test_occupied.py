@@ -17,7 +17,7 @@ from cadam3d.sweep import process
 from cadam3d.trainer import Trainer
 
 REPOSITORY = Path(__file__).parents[2]
-SMALL = ["prior=tiny", "prompt=a cube", "rasterizer=reference", "camera.size=8", "views=1", "steps=4"]
+SMALL = ["prior=tiny", "prompt=a cube", "rasterizer=auto", "camera.size=8", "views=1", "steps=4"]
 SMALL += ["initializer.count=7", "metric=[size]", "exporter=[ply]", "callback.metrics.every=1"]
 PROCESSES, ROUNDS = 3, 6
 
