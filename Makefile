@@ -5,7 +5,7 @@
 #             the time of installing; PART=checks and so on (docs/notes/performance.md) do it in parts of less than ten
 # make docs   build the documentation as a site into the folder site, strictly: no warning, no broken link
 # make clean  remove .venv and caches; outputs stay
-# PYTHON=python3.12 chooses the interpreter; JOBS=2 sets the number of test processes.
+# PYTHON=python3.12 chooses the interpreter; JOBS=2 sets the number of test processes, else one more than cores.
 
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
 CANDIDATES := python3 python3.13 python3.12 python3.11
