@@ -60,10 +60,10 @@ def read_object(path: str, key: str, up: str) -> TexturedMesh:
     ``up`` is the up axis of the file. Raises ``UserError``, which names ``key``, if it cannot be read.
     """
     mesh = read_mesh(path, key, up=up)
-    used = mesh.vertices[mesh.faces.unique()]
+    used = mesh.vertices[mesh.faces.unique()]  # in float64, since a mesh may be far from the origin
     middle = (used.amin(0) + used.amax(0)) / 2
     radius = (used - middle).norm(dim=1).max()
-    return replace(mesh, vertices=(mesh.vertices - middle) * (FIT_RADIUS / radius))
+    return replace(mesh, vertices=((mesh.vertices - middle) * (FIT_RADIUS / radius)).float())
 
 
 @lru_cache(maxsize=16)
@@ -75,14 +75,13 @@ def _drawn(mesh: TexturedMesh, cameras: Cameras, samples: int) -> Float[Tensor, 
     """Return premultiplied RGB and alpha, with ``samples`` x ``samples`` points per pixel."""
     fine = cameras.resize(cameras.height * samples, cameras.width * samples)
     is_solid = partial(_is_solid, mesh) if mesh.textures.has_holes else None
-    images = mesh.vertices.new_zeros(len(cameras), cameras.height * cameras.width, 4)
+    images = []
     for view in range(len(cameras)):
         hits = first_hits(mesh.corners, fine, view, is_solid)
-        row = torch.div(hits.point, fine.width * samples, rounding_mode="floor")
-        column = torch.div(hits.point % fine.width, samples, rounding_mode="floor")
-        color = torch.nn.functional.pad(_lit(mesh, fine, view, hits), (0, 1), value=1.0)
-        images[view].index_add_(0, row * cameras.width + column, color / samples**2)
-    return images.clamp_max(1.0).reshape(-1, cameras.height, cameras.width, 4).permute(0, 3, 1, 2)
+        points = mesh.vertices.new_zeros(fine.height * fine.width, 4)
+        points[hits.point] = torch.nn.functional.pad(_lit(mesh, fine, view, hits), (0, 1), value=1.0)
+        images.append(points.view(cameras.height, samples, cameras.width, samples, 4).mean(dim=(1, 3)))
+    return torch.stack(images).clamp_max(1.0).permute(0, 3, 1, 2)
 
 
 def _is_solid(mesh: TexturedMesh, hits: Hits) -> Bool[Tensor, "n"]:
@@ -90,7 +89,7 @@ def _is_solid(mesh: TexturedMesh, hits: Hits) -> Bool[Tensor, "n"]:
 
 
 def _lit(mesh: TexturedMesh, fine: Cameras, view: int, hits: Hits) -> Float[Tensor, "n 3"]:
-    """Return the RGB of hits in the light of the world; both sides of a face are lit as its front is."""
+    """Return the RGB of hits in the light of the world; the side of a face that is seen is its front."""
     corners = mesh.corners.index_select(0, hits.face)
     flat = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat = flat * _side(flat, fine.positions[view] - corners[:, 0])

@@ -7,7 +7,8 @@ is the projection of
 
 It is inside if all e_i have the same sign, and no triangle has to be clipped: one that is partly behind the
 camera is tried at every point (Olano and Greer 1997). Pixels are counted from the corner of each triangle's
-box, which keeps the cross products exact enough in float32.
+box, which keeps the cross products exact enough in float32. Each triangle is enlarged a little, because
+rounding could leave a point on a common edge out of both of its triangles.
 """
 
 from collections.abc import Callable
@@ -24,6 +25,7 @@ from cadam3d.core.cameras import Cameras
 NEAR = 0.01  # world units, as in the rasterizers
 CHUNK = 1 << 21  # points in the boxes of triangles that are tried together
 SLACK = 0.01  # pixels, more than the rounding of the ends of a row
+GROWTH = 1e-4  # of the size of a triangle, by which it is enlarged
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,19 @@ class Hits:
     def where(self, chosen: Int[Tensor, "m"]) -> "Hits":
         """Return the chosen rows."""
         return Hits(*(getattr(self, name).index_select(0, chosen) for name in Hits.__dataclass_fields__))
+
+    def joined(self, other: "Hits") -> "Hits":
+        """Return the rows of both."""
+        return Hits(*(torch.cat([vars(self)[name], vars(other)[name]]) for name in vars(self)))
+
+    def nearest(self, points: int) -> "Hits":
+        """Return the nearest hit of each of ``points`` points that has one."""
+        depth = self.depth.new_full((points,), torch.inf).scatter_reduce_(0, self.point, self.depth, "amin")
+        hits = self.where((self.depth <= depth[self.point]).nonzero()[:, 0])
+        # Of two triangles at the same depth, such as at a common edge, the later one is seen.
+        winner = torch.full_like(depth, -1, dtype=torch.long)
+        winner.scatter_reduce_(0, hits.point, torch.arange(len(hits.point), device=winner.device), "amax")
+        return hits.where(winner[winner >= 0])
 
 
 def first_hits(
@@ -57,22 +72,17 @@ def first_hits(
     a, b, c = (kept - torch.nn.functional.pad(low, (0, 0, 0, 1))[:, :, None] * kept[2]).unbind(2)
     cross = partial(torch.linalg.cross, dim=0)
     edges = torch.stack([cross(b, c), cross(c, a), cross(a, b)], dim=1)
-    volume = (a * edges[:, 0]).sum(0)
-    edges = edges * volume.sign()
-    found = []
+    edges = edges * (a * edges[:, 0]).sum(0).sign()
+    nearest = None
+    # The memory depends on the picture, and not on how many triangles are behind each other.
     for rows in _chunks((size[0] * size[1]).cumsum(0)):
-        part = (edges[:, :, rows], volume[rows].abs(), low[:, rows], size[:, rows], face[rows])
-        found.append(_inside(*part, fine.width))
-    hits = Hits(*(torch.cat([getattr(part, name) for part in found]) for name in Hits.__dataclass_fields__))
-    if is_solid is not None:
-        hits = hits.where(is_solid(hits).nonzero()[:, 0])
-    nearest = hits.depth.new_full((fine.width * fine.height,), torch.inf)
-    nearest.scatter_reduce_(0, hits.point, hits.depth, "amin")
-    hits = hits.where((hits.depth <= nearest[hits.point]).nonzero()[:, 0])
-    # Of two triangles at the same depth, such as at a common edge, the later one is seen.
-    winner = torch.full_like(nearest, -1, dtype=torch.long)
-    winner.scatter_reduce_(0, hits.point, torch.arange(len(hits.point), device=winner.device), "amax")
-    return hits.where(winner[winner >= 0])
+        part = (edges[:, :, rows], kept[2, rows], low[:, rows], size[:, rows], face[rows])
+        hits = _inside(*part, fine.width)
+        hits = hits if is_solid is None else hits.where(is_solid(hits).nonzero()[:, 0])
+        hits = hits if nearest is None else nearest.joined(hits)
+        nearest = hits.nearest(fine.width * fine.height)
+    assert nearest is not None
+    return nearest
 
 
 def _boxes(
@@ -84,8 +94,8 @@ def _boxes(
     least, most = torch.minimum(torch.minimum(a, b), c), torch.maximum(torch.maximum(a, b), c)
     limits = least.new_tensor([[width - 1], [height - 1]])
     is_cut = least[2] <= NEAR
-    first = (least[:2] - 0.5).ceil().clamp_min(0).masked_fill(is_cut, 0)
-    last = torch.where(is_cut, limits, torch.minimum((most[:2] - 0.5).floor(), limits))
+    first = (least[:2] - 0.5 - SLACK).ceil().clamp_min(0).masked_fill(is_cut, 0)
+    last = torch.where(is_cut, limits, torch.minimum((most[:2] - 0.5 + SLACK).floor(), limits))
     size = (last - first + 1).clamp_min(0)
     face = ((size[0] * size[1] > 0) & (most[2] > NEAR)).nonzero()[:, 0]
     return face, first.index_select(1, face) + 0.5, size.index_select(1, face).long()
@@ -101,7 +111,7 @@ def _chunks(ends: Int[Tensor, "n"]) -> list[slice]:
 
 def _inside(
     edges: Float[Tensor, "3 3 n"],
-    volume: Float[Tensor, "n"],
+    depth: Float[Tensor, "n 3"],
     low: Float[Tensor, "2 n"],
     size: Int[Tensor, "2 n"],
     face: Int[Tensor, "n"],
@@ -122,13 +132,13 @@ def _inside(
     shares = level.index_select(1, row) + slope.index_select(1, row) * x
     total = shares.sum(0)
     owner = owner.index_select(0, row)
-    # The depth is volume / total.
-    is_inside = (shares.amin(0) >= 0) & (total > 0) & (volume.index_select(0, owner) > NEAR * total)
-    inside = is_inside.nonzero()[:, 0]
-    owner, total = owner[inside], total[inside]
+    inside = ((shares.amin(0) >= -GROWTH * total) & (total > 0)).nonzero()[:, 0]
+    owner, shares = owner[inside], shares.index_select(1, inside).clamp_min(0)
+    weights = (shares / shares.sum(0)).T
     left, upper = low.index_select(1, owner).long()
     point = (upper + y[row[inside]]) * width + left + x[inside].long()
-    return Hits(point, face[owner], (shares.index_select(1, inside) / total).T, volume[owner] / total)
+    hits = Hits(point, face[owner], weights, (weights * depth.index_select(0, owner)).sum(1))
+    return hits.where((hits.depth > NEAR).nonzero()[:, 0])
 
 
 def _repeated(count: Int[Tensor, "n"]) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]]:
