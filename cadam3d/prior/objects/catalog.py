@@ -1,15 +1,18 @@
 """Catalog: the objects of a folder of meshes, and which of them a prompt names."""
 
+import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, StringConstraints, TypeAdapter, ValidationError
 
 from cadam3d.core.checks import fail, nearest
+from cadam3d.core.console import visible
 from cadam3d.core.mesh.textured import TexturedMesh
 from cadam3d.io.mesh_file import SUFFIXES
 from cadam3d.io.reading import read_text
@@ -22,10 +25,22 @@ from cadam3d.prior.shapes.words import ARTICLES, FILLERS, typed_words
 WORLD = Path(__file__).parent / "world"  # the objects that come with cadam3d
 CATALOG = "catalog.json"
 KEY = "prior.folder"
+LARGEST_CATALOG = 1 << 24  # bytes
+MOST_FILES = 100_000  # of all kinds in a folder and its subfolders
 MOST_MODES = 8  # objects of one prompt
 CENSUS_OBJECTS = 32  # of a folder, evenly spaced
 # The parts of a file name that are words: "deckChair_02" has "deck" and "Chair".
 NAME_PART = re.compile(r"[^\W\d_]?[^\W\d_A-Z]+|[A-Z]+(?![a-z])")
+
+
+def _one_line(text: str) -> str:
+    if visible(text) != text or "\n" in text:
+        raise ValueError("control characters")
+    return text
+
+
+# Names and credits are shown in messages.
+Line = Annotated[str, StringConstraints(max_length=200), AfterValidator(_one_line)]
 
 
 class Entry(BaseModel):
@@ -33,12 +48,12 @@ class Entry(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
-    id: str = ""
+    id: Line = ""
     file: str  # within the folder
-    name: str
-    tags: tuple[str, ...] = ()
-    licence: str = ""
-    author: str = ""
+    name: Line
+    tags: tuple[Line, ...] = ()
+    licence: Line = ""
+    author: Line = ""
     up: Literal["-y", "+y", "+z"] = "+y"  # the up axis of the file
 
     @property
@@ -61,14 +76,14 @@ class Catalog:
 
     def matching(self, prompt: str) -> list[Entry]:
         """Return the objects that a prompt names: those with this name, else those with all of its words."""
-        asked = [word for word in _words(prompt) if word not in ARTICLES | FILLERS]
-        named = [entry for entry in self.entries if asked and _words(entry.name) == asked]
+        asked = _asked(prompt)
+        named = [entry for entry in self.entries if asked and _asked(entry.name) == asked]
         return named or [entry for entry in self.entries if asked and entry.words.issuperset(asked)]
 
     def nearest(self, prompt: str) -> str:
-        """Return the name of an object that is spelled nearly like the prompt or a word of it; "" if none."""
-        asked = [word for word in _words(prompt) if word not in ARTICLES | FILLERS]
-        names = [entry.name for entry in self.entries]
+        """Return the words of an object's name that are nearly the prompt or a word of it; "" if none."""
+        asked = _asked(prompt)
+        names = [" ".join(_words(entry.name)) for entry in self.entries]
         near = (nearest(text, names, least=SIMILAR) for text in (" ".join(asked), *asked))
         return next(filter(None, near), "")
 
@@ -81,7 +96,7 @@ class Catalog:
         sample = _spread(self.entries, CENSUS_OBJECTS)
         states = [(self.folder / entry.file).stat() for entry in sample]
         facts = [
-            (entry.file, state.st_size, state.st_mtime_ns)
+            (entry.file, entry.up, state.st_size, state.st_mtime_ns)
             for entry, state in zip(sample, states, strict=True)
         ]
         return _census(self, size, f"objects {self.folder.resolve()} {facts}")
@@ -100,10 +115,15 @@ def _census(catalog: Catalog, size: int, identity: str) -> Census:
 def read_catalog(folder: str | None) -> Catalog:
     """Return the objects of the folder in ``prior.folder``; None means those that come with cadam3d.
 
-    Raises ``UserError`` if there are none, or if ``catalog.json`` does not list files of the folder.
+    Raises ``UserError`` if there are none, and for files or links that lead out of the folder.
     """
     place = WORLD if folder is None else expanded(folder)
     entries = _listed(place) if has_file(place, CATALOG) else tuple(_found(place))
+    inside = place.resolve() if entries else place
+    for entry in entries:
+        file = place / entry.file
+        if not has_file(file) or not file.resolve().is_relative_to(inside):
+            raise fail(KEY, expected="files that exist and are within the folder", got=entry.file)
     if not entries:
         expected = f"a folder with meshes ({', '.join(SUFFIXES)}) or a {CATALOG}"
         raise fail(KEY, expected=expected, got=str(folder), example=f"{KEY}=DIR")
@@ -116,29 +136,37 @@ def modes(entries: Sequence[Entry]) -> list[Entry]:
 
 
 def _listed(folder: Path) -> tuple[Entry, ...]:
-    """Return the entries of the catalogue of a folder; each names a file within it."""
+    """Return the entries of the catalogue of a folder."""
     try:
-        text = read_text(folder / CATALOG)
-        entries = TypeAdapter(tuple[Entry, ...]).validate_json(text)
+        text = read_text(folder / CATALOG, largest=LARGEST_CATALOG)
+        return TypeAdapter(tuple[Entry, ...]).validate_json(text)
     except ValidationError as error:
         problem = error.errors()[0]
         place = ".".join(map(str, problem["loc"]))
         expected = f"a {CATALOG} with a file and a name for each object"
         raise fail(KEY, expected=expected, got=f"{place}: {problem['msg']}", example=f"{KEY}=DIR") from error
-    inside = folder.resolve()
-    for entry in entries:
-        file = folder / entry.file
-        if not has_file(file) or not file.resolve().is_relative_to(inside):
-            raise fail(KEY, expected=f"files within the folder in {CATALOG}", got=entry.file)
-    return entries
 
 
 def _found(folder: Path) -> Iterator[Entry]:
     """Return an entry for each mesh in a folder and its subfolders; file names count as names."""
-    for file in sorted(folder.rglob("*")) if folder.is_dir() else ():
-        if file.suffix.lower() in SUFFIXES and file.is_file():
+    files = list(islice(folder.rglob("*"), MOST_FILES + 1)) if os.path.isdir(folder) else []
+    if len(files) > MOST_FILES:
+        raise fail(KEY, expected=f"a folder with at most {MOST_FILES:,} files", got=str(folder))
+    for file in sorted(files):
+        # macOS and editors add hidden files with the same endings.
+        if file.suffix.lower() in SUFFIXES and file.is_file() and not file.name.startswith("."):
             name = " ".join(NAME_PART.findall(file.stem)).lower() or file.stem
-            yield Entry(file=file.relative_to(folder).as_posix(), name=name)
+            try:
+                yield Entry(file=file.relative_to(folder).as_posix(), name=name)
+            except ValidationError as error:
+                expected = "file names without control characters"
+                raise fail(KEY, expected=expected, got=file.name) from error
+
+
+def _asked(text: str) -> list[str]:
+    """Return the words of a prompt or of a name without those that say nothing, unless it has no others."""
+    words = [word for word in _words(text) if word not in ARTICLES]
+    return [word for word in words if word not in FILLERS] or words
 
 
 def _words(text: str) -> list[str]:

@@ -33,7 +33,7 @@ class ObjectsPrior(ExactPrior):
         catalog, found = read_catalog(self.folder), self.named(prompt)
         if not found:
             known = "the name or a tag of an object" + (f" in {self.folder}" if self.folder else "")
-            name = catalog.nearest(prompt) or catalog.entries[0].name
+            name = catalog.nearest(prompt) or catalog.nearest(catalog.entries[0].name)
             raise fail(key, expected=known, got=prompt, example=f'{key}="a {name}"')
         return catalog.scene(found)
 
