@@ -1,8 +1,8 @@
 """Catalog: the objects of a folder of meshes, and which of them a prompt names."""
 
-import os
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
@@ -149,7 +149,10 @@ def _listed(folder: Path) -> tuple[Entry, ...]:
 
 def _found(folder: Path) -> Iterator[Entry]:
     """Return an entry for each mesh in a folder and its subfolders; file names count as names."""
-    files = list(islice(folder.rglob("*"), MOST_FILES + 1)) if os.path.isdir(folder) else []
+    files: list[Path] = []
+    # A name that no folder can have is an OSError.
+    with suppress(OSError):
+        files = list(islice(folder.rglob("*"), MOST_FILES + 1)) if folder.is_dir() else []
     if len(files) > MOST_FILES:
         raise fail(KEY, expected=f"a folder with at most {MOST_FILES:,} files", got=str(folder))
     for file in sorted(files):
