@@ -102,7 +102,7 @@ def test_alpha_cuts_holes_unless_the_material_is_opaque(tmp_path, mode, alpha):
     base = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}, "alphaMode": mode}
     image = {"uri": data_uri(png((0, 0, 255, 0), mode="RGBA"))}
     mesh = read(tmp_path, "a.gltf", gltf(images=[image], textures=[{"source": 0}], materials=[base]))
-    assert colors(mesh)[3] == alpha
+    assert colors(mesh)[3] == pytest.approx(alpha)
     assert mesh.textures.has_holes == (mode != "OPAQUE")
 
 
@@ -137,7 +137,7 @@ def test_pictures_of_every_kind_are_read(tmp_path, mode):
 )
 def test_a_zip_file_with_folders_has_its_texture(tmp_path, capsys, named, file):
     files = {"model/a.obj": SKIN, "model/a.mtl": MTL.replace("skin.png", named), file: png()}
-    assert colors(read(tmp_path, "a.zip", zipped(files))) == [0, 0, 1, 1]
+    assert colors(read(tmp_path, "a.zip", zipped(files))) == pytest.approx([0, 0, 1, 1])
     assert not capsys.readouterr().err
 
 
@@ -205,7 +205,7 @@ REFUSED = {
     "deep.gltf": ('{"a":' + "[" * 100_000, "recursion"),
     "list.gltf": ("[]", "cannot be read"),
     "lines.gltf": ('{"\x1b[2J\n\n', "cannot be read"),
-    "zeros.gltf": (few(bufferView=None, count=300_000_000), "300,000,0"),
+    "zeros.gltf": (few(bufferView=None, count=300_000_000), "rows"),
     "less.gltf": (few(count=-3), "cannot be read"),
     "outside.gltf": (gltf(buffers=[{"byteLength": 48, "uri": "../../etc/passwd"}]), "escapes"),
     "remote.gltf": (gltf(buffers=[{"byteLength": 48, "uri": "http://127.0.0.1:9/x"}]), "cannot be read"),
@@ -282,7 +282,7 @@ def test_a_missing_normal_map_or_an_unused_material_is_no_note(tmp_path, capfd):
     textures = [{"source": 0}, {"source": 1}, {"source": 1}]
     unused = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 2}}}
     mesh = read(tmp_path, "a.gltf", gltf(images=images, textures=textures, materials=[used, unused]))
-    assert colors(mesh) == [0, 0, 1, 1]
+    assert colors(mesh) == pytest.approx([0, 0, 1, 1])
     assert not capfd.readouterr().err
 
 
@@ -291,7 +291,7 @@ def test_a_large_picture_is_kept_small(tmp_path):
     (tmp_path / "a.mtl").write_text(MTL)
     mesh = read(tmp_path, "a.obj", SKIN)
     assert mesh.textures.levels[0, 0].tolist() == [0, FINEST, FINEST // 4]
-    assert colors(mesh) == [0, 0, 1, 1]
+    assert colors(mesh) == pytest.approx([0, 0, 1, 1])
 
 
 def test_the_first_mesh_of_a_zip_file_is_read_and_hidden_files_do_not_count(tmp_path, capfd):
@@ -321,16 +321,18 @@ def test_texture_coordinates_that_are_no_numbers_give_finite_colors(tmp_path):
     (tmp_path / "a.mtl").write_text(MTL)
     (tmp_path / "skin.png").write_bytes(png())
     mesh = read(tmp_path, "a.obj", SKIN.replace("vt 0 0", "vt nan inf").replace("vt 1 0", "vt 1e300 -1e300"))
-    assert colors(mesh) == [0, 0, 1, 1]
+    assert colors(mesh) == pytest.approx([0, 0, 1, 1])
 
 
 @pytest.mark.slow
 def test_a_million_triangles_need_a_plausible_memory(tmp_path):
     trimesh.creation.icosphere(subdivisions=8).export(tmp_path / "a.glb")
     code = (
-        "import resource\nfrom cadam3d.prior.objects.scene import read_object\n"
-        f"mesh = read_object({str(tmp_path / 'a.glb')!r}, 'truth.path', '+y')\nassert len(mesh.normals) == 1310720\n"
+        "import resource, sys\nfrom cadam3d.prior.objects.scene import read_object\n"
+        "assert len(read_object(sys.argv[1], 'truth.path', '+y').normals) == 1310720\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "a.glb")], capture_output=True, text=True, check=True
+    )
     assert int(done.stdout) < 2_500_000  # kB

@@ -73,6 +73,7 @@ def first_hits(
     cross = partial(torch.linalg.cross, dim=0)
     edges = torch.stack([cross(b, c), cross(c, a), cross(a, b)], dim=1)
     edges = edges * (a * edges[:, 0]).sum(0).sign()
+    edges = edges + GROWTH * edges.sum(1, keepdim=True)
     nearest = None
     # The memory depends on the picture, and not on how many triangles are behind each other.
     for rows in _chunks((size[0] * size[1]).cumsum(0)):
@@ -132,9 +133,8 @@ def _inside(
     shares = level.index_select(1, row) + slope.index_select(1, row) * x
     total = shares.sum(0)
     owner = owner.index_select(0, row)
-    inside = ((shares.amin(0) >= -GROWTH * total) & (total > 0)).nonzero()[:, 0]
-    owner, shares = owner[inside], shares.index_select(1, inside).clamp_min(0)
-    weights = (shares / shares.sum(0)).T
+    inside = ((shares.amin(0) >= 0) & (total > 0)).nonzero()[:, 0]
+    owner, weights = owner[inside], (shares.index_select(1, inside) / total[inside]).T
     left, upper = low.index_select(1, owner).long()
     point = (upper + y[row[inside]]) * width + left + x[inside].long()
     hits = Hits(point, face[owner], weights, (weights * depth.index_select(0, owner)).sum(1))

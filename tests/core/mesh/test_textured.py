@@ -16,7 +16,7 @@ def checkerboard(size: int) -> np.ndarray:
 
 
 def colors_at(uv, picture: np.ndarray = COLORS, level: int = 0) -> torch.Tensor:
-    uv = torch.tensor(uv, dtype=torch.float64).reshape(-1, 2)
+    uv = torch.as_tensor(uv, dtype=torch.float64).reshape(-1, 2)
     zero = torch.zeros(len(uv), dtype=torch.long)
     return Textures.of([picture]).at(zero, uv, zero + level)
 
@@ -36,7 +36,8 @@ def textured(shape: trimesh.Trimesh, **changes) -> TexturedMesh:
 
 @pytest.mark.parametrize("shift", [0.0, 1.0, -3.0])
 def test_a_texel_is_where_uv_counts_from_the_lower_left_and_pictures_repeat(shift):
-    found = colors_at([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]] + np.full((4, 2), shift))
+    corners = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
+    found = colors_at(corners + shift)
     expected = torch.tensor(COLORS[[1, 1, 0, 0], [0, 1, 0, 1]]).double() / 255
     torch.testing.assert_close(found, expected)
 
