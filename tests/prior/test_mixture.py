@@ -16,20 +16,25 @@ MEANS = torch.tensor([[-0.6, 0.5], [0.7, 0.6], [0.1, -0.8]], dtype=torch.float64
 SIGMA = torch.tensor([0.15, 0.30], dtype=torch.float64)
 
 
+# A standard deviation for each mode, as where the outlines of objects differ.
+SIGMAS = torch.tensor([[0.15, 0.30], [0.40, 0.10], [0.20, 0.25]], dtype=torch.float64)
+SPREADS = [pytest.param(SIGMA, id="shared"), pytest.param(SIGMAS, id="per mode")]
+
+
 def small(views: int, sigma: Tensor = SIGMA) -> Mixture:
     """The same three modes in every view: one channel, one row, two pixels."""
     return Mixture(
         means=MEANS.reshape(1, 3, 1, 1, 2).expand(views, -1, -1, -1, -1),
         log_weights=WEIGHTS.log(),
-        variance=sigma.square().reshape(1, 1, 1, 1, 2).expand(views, -1, -1, -1, -1),
+        variance=sigma.square().reshape(1, -1, 1, 1, 2).expand(views, -1, -1, -1, -1),
     )
 
 
-def draw(count: int, generator: torch.Generator) -> Tensor:
+def draw(count: int, generator: torch.Generator, sigma: Tensor = SIGMA) -> Tensor:
     """Draw samples of the mixture directly."""
     mode = torch.multinomial(WEIGHTS, count, replacement=True, generator=generator)
     noise = torch.randn(count, 2, generator=generator, dtype=torch.float64)
-    return (MEANS[mode] + SIGMA * noise).reshape(count, 1, 1, 2)
+    return (MEANS[mode] + sigma.expand(3, 2)[mode] * noise).reshape(count, 1, 1, 2)
 
 
 def total_variance(mixture: Mixture, a: Tensor, b: Tensor) -> Tensor:
@@ -49,19 +54,20 @@ def at(path: NoisePath, t: float, views: int = 1) -> tuple[Tensor, Tensor, Tenso
 
 @pytest.mark.parametrize("path", PATHS)
 @pytest.mark.parametrize("t", [0.1, 0.7])
-def test_posterior_mean_equals_monte_carlo(path: NoisePath, t: float) -> None:
+@pytest.mark.parametrize("sigma", SPREADS)
+def test_posterior_mean_equals_monte_carlo(path: NoisePath, t: float, sigma: Tensor) -> None:
     """Weight samples of the prior by the likelihood of the noisy image, without a formula of the mixture."""
     generator = torch.Generator().manual_seed(0)
-    samples = draw(400_000, generator).reshape(-1, 2)
+    samples = draw(400_000, generator, sigma).reshape(-1, 2)
     _, a, b = at(path, t)
     for _ in range(4):
-        start = draw(1, generator)
+        start = draw(1, generator, sigma)
         noise = torch.randn(1, 1, 1, 2, generator=generator, dtype=torch.float64)
         noisy = per_view(a) * start + per_view(b) * noise
         weights = (-0.5 * ((noisy.reshape(2) - a * samples) / b).square().sum(1)).softmax(0)
         expected = weights @ samples
         error = (weights.square() @ (samples - expected).square()).sqrt()
-        clean, predicted_noise = small(1).denoise(noisy, a, b)
+        clean, predicted_noise = small(1, sigma).denoise(noisy, a, b)
         assert bool(((clean.reshape(2) - expected).abs() < 5 * error + 1e-6).all())
         from_samples = (noisy.reshape(2) - a * expected) / b
         assert bool(((predicted_noise.reshape(2) - from_samples).abs() < (5 * error + 1e-6) * a / b).all())
