@@ -29,7 +29,7 @@ from cadam3d.report.style import looks
 from cadam3d.settings.compose import compose
 from cadam3d.state import RunContext, StepReport, TrainState
 
-PROMPT = "a snowman next to a pine"
+PROMPT = "a cupcake"
 ARMS = ("baseline", "cadam")
 STEPS = 600
 EVERY = 10  # steps between two pictures
