@@ -26,14 +26,12 @@ from trimesh.resolvers import FilePathResolver
 
 from cadam3d.core.console import say
 from cadam3d.core.errors import UserError
-from cadam3d.core.mesh.textured import TexturedMesh, Textures
+from cadam3d.core.mesh.textured import MESH_SUFFIXES, TexturedMesh, Textures
 from cadam3d.io.frames import points_to_world
 from cadam3d.io.gltf import leading_document, linear, srgb
 from cadam3d.io.reading import read_bytes
 from cadam3d.io.run_folder import found_file
 
-# Other formats of trimesh may refer to files elsewhere, or run other programs.
-SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 # Vertex colours are linear in these files, and textures are sRGB (glTF 2.0, sec. 3.9.2). Other
 # formats have sRGB colours only.
 LINEAR_SUFFIXES = (".glb", ".gltf")
@@ -72,7 +70,7 @@ def read_mesh(
     except Exception as error:
         reason = " ".join(str(error).split())[:LONGEST] or type(error).__name__
         raise UserError(
-            f"{key}: expected a file with a mesh ({', '.join(SUFFIXES)}, or one of them in a .zip), "
+            f"{key}: expected a file with a mesh ({', '.join(MESH_SUFFIXES)}, or one of them in a .zip), "
             f"got {path!r}, which cannot be read ({reason})."
         ) from error
     if not area > 0:
@@ -133,7 +131,7 @@ class _Nearby(_Source):
     def __init__(self, file: Path) -> None:
         super().__init__()
         self.suffix, self.folder = file.suffix.lower(), FilePathResolver(str(file))
-        if self.suffix not in SUFFIXES:
+        if self.suffix not in MESH_SUFFIXES:
             raise ValueError("another kind of file")
         self.content = read_bytes(file, largest=LARGEST_FILE)
 
@@ -167,7 +165,7 @@ class _Zipped(_Source):
 def _is_mesh(name: str) -> bool:
     """Return whether a name in a zip file is that of a mesh. macOS adds hidden files with such names."""
     path = PurePosixPath(name)
-    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+    return path.suffix.lower() in MESH_SUFFIXES and not path.name.startswith(".")
 
 
 @contextmanager

@@ -9,6 +9,9 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+# The meshes that are read (``io/mesh_file.py``). Other formats may refer to files elsewhere, or run other
+# programs.
+MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 # Faces that meet at a smaller angle are shaded as one smooth surface.
 CREASE_DEG = 40.0
 

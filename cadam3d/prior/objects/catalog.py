@@ -13,8 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, StringConstraints, T
 
 from cadam3d.core.checks import fail, nearest
 from cadam3d.core.console import visible
-from cadam3d.core.mesh.textured import TexturedMesh
-from cadam3d.io.mesh_file import SUFFIXES
+from cadam3d.core.mesh.textured import MESH_SUFFIXES, TexturedMesh
 from cadam3d.io.reading import read_text
 from cadam3d.io.run_folder import expanded, has_file
 from cadam3d.prior.exact import Census, stored_census
@@ -125,7 +124,7 @@ def read_catalog(folder: str | None) -> Catalog:
         if not has_file(file) or not file.resolve().is_relative_to(inside):
             raise fail(KEY, expected="files that exist and are within the folder", got=entry.file)
     if not entries:
-        expected = f"a folder with meshes ({', '.join(SUFFIXES)}) or a {CATALOG}"
+        expected = f"a folder with meshes ({', '.join(MESH_SUFFIXES)}) or a {CATALOG}"
         raise fail(KEY, expected=expected, got=str(folder), example=f"{KEY}=DIR")
     return Catalog(place, entries)
 
@@ -157,7 +156,7 @@ def _found(folder: Path) -> Iterator[Entry]:
         raise fail(KEY, expected=f"a folder with at most {MOST_FILES:,} files", got=str(folder))
     for file in sorted(files):
         # macOS and editors add hidden files with the same endings.
-        if file.suffix.lower() in SUFFIXES and file.is_file() and not file.name.startswith("."):
+        if file.suffix.lower() in MESH_SUFFIXES and file.is_file() and not file.name.startswith("."):
             name = " ".join(NAME_PART.findall(file.stem)).lower() or file.stem
             try:
                 yield Entry(file=file.relative_to(folder).as_posix(), name=name)

@@ -12,7 +12,6 @@ from torch import Tensor
 from cadam3d.core.cameras import Cameras
 from cadam3d.core.mesh.textured import TexturedMesh, mixed
 from cadam3d.core.rendering import Triangles
-from cadam3d.io.mesh_file import read_mesh
 from cadam3d.prior.exact import Census, ExactScene
 from cadam3d.prior.light import light_on
 from cadam3d.prior.objects.zbuffer import Hits, first_hits
@@ -59,6 +58,8 @@ def read_object(path: str, key: str, up: str) -> TexturedMesh:
 
     ``up`` is the up axis of the file. Raises ``UserError``, which names ``key``, if it cannot be read.
     """
+    from cadam3d.io.mesh_file import read_mesh  # trimesh is slow to import
+
     mesh = read_mesh(path, key, up=up)
     used = mesh.vertices[mesh.faces.unique()]  # in float64, since a mesh may be far from the origin
     middle = (used.amin(0) + used.amax(0)) / 2
