@@ -75,7 +75,8 @@ def main() -> None:
     with replacing(OUTPUT) as temporary:
         Image.fromarray(np.concatenate(lines)).save(temporary, "WEBP", quality=QUALITY)
     for prompt, rows in sorted(objects.items()):
-        cells = (f"{row.summary['num_gaussians']:,} at {row.summary['psnr']:.2f}" for row in rows.values())
+        results = (rows[arm].summary for arm in typed.arms)
+        cells = (f"{each['num_gaussians']:,}, {each['psnr']:.2f} dB, {each['ssim']:.3f}" for each in results)
         print(f"| {prompt} | {' | '.join(cells)} |")
 
 
