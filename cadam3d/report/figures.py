@@ -142,7 +142,9 @@ def growth_figure(results: Sequence[JobResult]) -> Figure | None:
 
 
 def _histories(results: Sequence[JobResult], setting: ArmSetting) -> list[list[Point]]:
-    found = [counts(read_metrics(result.folder)) for result in by_cell(results, setting).values()]
+    found: list[list[Point]] = [
+        list(counts(read_metrics(result.folder))) for result in by_cell(results, setting).values()
+    ]
     return [history for history in found if history]
 
 
