@@ -171,7 +171,7 @@ def _compose_once() -> None:
         place = (*key, *(states[path] for path in paths))
         if place not in kept:
             kept[place] = pickle.dumps(make())
-        # Hydra changes what it gets. A copy from bytes takes a fifth of the time of copy.deepcopy.
+        # Hydra modifies its input. Unpickling a copy is five times as fast as copy.deepcopy.
         return pickle.loads(kept[place])
 
     def load_once(self, config_path):

@@ -31,7 +31,7 @@ class Live(RowHistory):
     """
 
     seconds: Annotated[float, within(low=0.1)]  # between two snapshots
-    share: Annotated[float, within(above=0, high=1)]  # of the time of training
+    share: Annotated[float, within(above=0, high=1)]  # share of the training time
     # Whether files can be written. Becomes False after the first failure.
     _works: bool = field(default=False, init=False, repr=False)
     _watch: Watch = field(default_factory=lambda: Watch(Path()), init=False, repr=False)

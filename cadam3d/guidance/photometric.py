@@ -49,7 +49,7 @@ class Photometric(Guidance):
             expected = "an objective for this prior, which does not know the true images"
             raise fail("guidance", expected=expected, got="photometric", example="guidance=sds")
         l1 = (rgb - true).abs().mean()
-        # Half of (1 - SSIM), so twice of it is meant.
+        # The loss of kornia is half of 1 - SSIM.
         unlike = 2 * ssim_loss(rgb.permute(0, 3, 1, 2), true.permute(0, 3, 1, 2), SSIM_WINDOW)
         loss = self.weight * ((1 - self.ssim_share) * l1 + self.ssim_share * unlike)
         return GuidanceOutput(loss=loss, log={"l1": l1.detach()})

@@ -201,7 +201,7 @@ class LatentPrior(DiffusionPrior):
 
         The working memory is what the autoencoder keeps for the backward pass; the denoiser has no gradient
         and needs less. On the CPU it may also be the denoiser's file, while that is converted. Renders have
-        ``size`` pixels per side (512 if that is None too) unless the prior resizes them. Raises ``UserError``
+        ``size`` pixels per side (512 if this is None) unless the prior resizes them. Raises ``UserError``
         in the cases in which :meth:`embed` does, since training calls this first.
         """
         self._require_readable(prompt, negative)
