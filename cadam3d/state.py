@@ -36,7 +36,8 @@ GENERATORS = (
 )
 # The entries of a checkpoint that are neither tensors nor dicts.
 COUNTS = ("step", "num_initial", "skipped", "dimmed", "seed")
-PLAIN = (*COUNTS, "seconds", "initial_note", "refused")
+TIMES = ("seconds", "cpu_seconds")
+PLAIN = (*COUNTS, *TIMES, "initial_note", "refused")
 MOST = 10**4000  # Python refuses to write much longer numbers
 
 
@@ -50,6 +51,7 @@ class TrainState:
 
     step: int  # steps done
     seconds: float  # wall-clock time spent on them
+    cpu_seconds: float  # time that the CPU spent on them, summed over all threads of the process
     num_initial: int  # Gaussians at step 0
     # Which fallback replaced the chosen initializer, and why; None if the chosen one was used.
     initial_note: str | None
@@ -190,7 +192,7 @@ def _require_sound(payload: Any, optimizer: AdamSettings, densifier: Densifier) 
     )
     template = {
         **dict.fromkeys(COUNTS, 0),
-        "seconds": 0.0,
+        **dict.fromkeys(TIMES, 0.0),
         "initial_note": note if isinstance(note, str) and note.isprintable() else None,
         "refused": False,
         "gaussians": blank.tensors(),
@@ -198,9 +200,7 @@ def _require_sound(payload: Any, optimizer: AdamSettings, densifier: Densifier) 
         "densifier": rows,
         "generators": {name: draw.get_state() for name, draw in start_generators(0).items()},
     }
-    if _form(payload) != _form(template) or not all(
-        0 <= payload[name] < MOST for name in (*COUNTS, "seconds")
-    ):
+    if _form(payload) != _form(template) or not all(0 <= payload[name] < MOST for name in (*COUNTS, *TIMES)):
         raise PayloadError("its entries are not those of a run")
 
 

@@ -96,7 +96,7 @@ class Trainer:
     def step(self, state: TrainState, embedding: PromptEmbedding) -> tuple[StepReport, RefineReport | None]:
         """Advance ``state`` in place by one step, and by a refinement or opacity reset if one is due.
 
-        Callbacks are not called, and ``state.seconds`` does not change.
+        Callbacks are not called, and the times of ``state`` do not change.
         """
 
         def look(render: Render) -> Evidence:
@@ -243,6 +243,7 @@ class Trainer:
         return TrainState(
             step=0,
             seconds=0.0,
+            cpu_seconds=0.0,
             num_initial=len(gaussians),
             initial_note=beginning.note,
             skipped=0,
@@ -265,8 +266,8 @@ class Trainer:
 
         ``stop()`` is called after every step and interrupts the run if it returns True. While the run is
         paused it does not return, and calls :meth:`wait` instead; this time is not part of
-        ``state.seconds``. Running out of memory is an outcome. Any other exception is raised again after
-        ``on_abort`` of the callbacks.
+        ``state.seconds`` and ``state.cpu_seconds``. Running out of memory is an outcome. Any other exception
+        is raised again after ``on_abort`` of the callbacks.
         """
         for callback in self.callbacks:
             callback.on_start(context, state)
@@ -276,9 +277,10 @@ class Trainer:
                 self._report(context, state, self._refine(state, state.step), None)
             outcome = self.outcome(state)
             while outcome is None:
-                started = time.perf_counter()
+                started, cpu_started = time.perf_counter(), time.process_time()
                 report, refined = self.step(state, embedding)
                 state.seconds += time.perf_counter() - started
+                state.cpu_seconds += time.process_time() - cpu_started
                 self._report(context, state, refined, report)
                 outcome = self.outcome(state)
                 if outcome is None and stop():

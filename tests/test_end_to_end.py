@@ -92,7 +92,7 @@ def test_a_run_leaves_everything_that_the_readme_promises(finished):
     latest = finished / "outputs" / "latest"
     summary = json.loads((latest / "summary.json").read_text())
     promised = "prompt seed steps outcome num_gaussians_initial num_gaussians asset_bytes seconds"
-    promised += " densifier guidance prior rasterizer psnr ssim"
+    promised += " cpu_seconds commit machine threads densifier guidance prior rasterizer psnr ssim"
     assert set(promised.split()) <= summary.keys()
     assert summary["outcome"] == "finished"
     assert summary["prompt"] == "a red cube"

@@ -49,6 +49,7 @@ def trained() -> tuple[TrainState, Any, Any]:
     state = TrainState(
         step=9,
         seconds=1.5,
+        cpu_seconds=2.5,
         num_initial=4,
         initial_note=None,
         skipped=1,

@@ -15,7 +15,15 @@ from cadam3d.callback.base import Callback
 from cadam3d.core.errors import UserError
 from cadam3d.regularizer import MeanScale
 from cadam3d.settings.compose import compose
-from cadam3d.state import Outcome, RefineReport, RunContext, StepReport, TrainState, start_generators
+from cadam3d.state import (
+    TIMES,
+    Outcome,
+    RefineReport,
+    RunContext,
+    StepReport,
+    TrainState,
+    start_generators,
+)
 from cadam3d.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -86,7 +94,7 @@ def same(left: dict, right: dict) -> bool:
         elif isinstance(value, torch.Tensor):
             if not torch.equal(value, other):
                 return False
-        elif key != "seconds" and value != other:
+        elif key not in TIMES and value != other:
             return False
     return True
 
@@ -116,10 +124,12 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, densifie
 
     _, state = make([f"densifier={densifier}"])
     for cut in (1, 4, 5, 8):
+        spent = [getattr(state, name) for name in TIMES]
         # The run stops early but has the schedules of the whole run.
         go(replace(trainer, steps=cut), state, tmp_path)
         torch.save(state.to_payload(), tmp_path / "part.pt")
         state = restore(trainer, torch.load(tmp_path / "part.pt", weights_only=True))
+        assert all(getattr(state, name) > before for name, before in zip(TIMES, spent, strict=True))
     assert same(whole.to_payload(), state.to_payload())
 
 

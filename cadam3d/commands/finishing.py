@@ -95,6 +95,7 @@ def summarize(
         "num_gaussians_initial": state.num_initial,
         "num_gaussians": len(state.gaussians),
         "seconds": round(state.seconds, 2),
+        "cpu_seconds": round(state.cpu_seconds, 2),
         "skipped_steps": state.skipped,
         "dimmed_steps": state.dimmed,
         **{name: choices.get(name) for name in COMPONENTS},

@@ -23,6 +23,7 @@ from cadam3d.commands.finishing import Results, measure_memory, print_result, su
 from cadam3d.commands.resuming import keep_start, start_or_resume
 from cadam3d.core.console import say
 from cadam3d.core.device import resolve_device
+from cadam3d.core.origin import origin_on
 from cadam3d.core.signals import ENDING, StopOnSignal
 from cadam3d.initializer.base import Initializer
 from cadam3d.io.declarations import write_declarations
@@ -51,6 +52,7 @@ def optimise(
     folder changes.
     """
     device = resolve_device(cfg.device)
+    origin = origin_on(device)  # now, because the checkout may change while the run lasts
     resume = Path(str(cfg.resume)) if cfg.resume else None
     with (
         occupied(call.folder, is_chosen=call.has_chosen_folder, resume=resume) as folder,
@@ -78,7 +80,7 @@ def optimise(
                 outcome = trainer.train(state, embedding, context, control)
                 log.info("%s after %d steps: %d Gaussians", outcome, state.step, len(state.gaussians))
                 summary = summarize(cfg, call.choices, state, outcome, backend)
-                summary |= memory | measure_memory(device) | {"schedule": schedule}
+                summary |= origin | memory | measure_memory(device) | {"schedule": schedule}
                 summary["grows"] = trainer.densifier.grows_from is not None
                 results.write(context, state.gaussians.detach(), start, summary)
                 for callback in trainer.callbacks:

@@ -23,7 +23,7 @@ from cadam3d.io.run_folder import checkpoint_step, checkpoints
 
 FORMAT = "cadam3d-checkpoint"
 # This number increases when old payloads can no longer be read.
-VERSION = 1
+VERSION = 2
 DTYPES = (
     *(torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.bool),
     *(torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8),

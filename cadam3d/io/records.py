@@ -257,14 +257,15 @@ def _is_histogram(line: dict[str, Any]) -> bool:
 # such as numbers of a metric from elsewhere.
 SUMMARY_KINDS: dict[str, Any] = {
     "warnings": list[str],
-    "seconds": Annotated[Real, Ge(0)],
+    **dict.fromkeys(("seconds", "cpu_seconds"), Annotated[Real, Ge(0)]),
     "seed": Annotated[int, Ge(0)],
     "grows": bool,
     **dict.fromkeys(("outcome", "prompt", "message", "device", "backend"), str),
     **dict.fromkeys(("negative_prompt", "densifier", "guidance", "prior", "initializer"), str | None),
+    **dict.fromkeys(("commit", "machine"), str | None),
     **dict.fromkeys(("rasterizer", "camera", "refine", "optimizer", "initializer_note", "truth"), str | None),
     **dict.fromkeys(("steps", "steps_asked", "num_gaussians", "num_gaussians_initial"), Whole),
-    **dict.fromkeys(("skipped_steps", "dimmed_steps", "asset_bytes"), Whole),
+    **dict.fromkeys(("skipped_steps", "dimmed_steps", "asset_bytes", "threads"), Whole),
     **dict.fromkeys(("psnr", "ssim", "psnr_turned", "ssim_turned"), Real | None),
     **dict.fromkeys(("memory_estimate_gib", "memory_peak_gib"), Real | None),
 }

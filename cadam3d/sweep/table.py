@@ -10,7 +10,10 @@ from cadam3d.io.run_folder import TABLE
 from cadam3d.io.text_tables import write_csv
 from cadam3d.sweep.folder import Row, load
 
-FACTS = ("num_gaussians", "num_gaussians_initial", "psnr", "ssim", "seconds", "asset_bytes", "message")
+FACTS = (
+    *("num_gaussians", "num_gaussians_initial", "psnr", "ssim", "seconds", "cpu_seconds", "asset_bytes"),
+    *("commit", "machine", "threads", "message"),
+)
 BRIEF = 80  # characters
 # Columns that only jobs with a prompt of a file or a set have.
 LABELS = ("prompt_name", "category")

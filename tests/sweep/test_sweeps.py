@@ -129,7 +129,8 @@ def test_the_table_has_one_row_per_job(hydra_sweep):
     rows = read_table(only_sweep())
     assert list(rows[0]) == [
         *("job", "arm", "prompt", "seed", "densifier", "outcome", "num_gaussians", "num_gaussians_initial"),
-        *("psnr", "ssim", "seconds", "asset_bytes", "message", "folder"),
+        *("psnr", "ssim", "seconds", "cpu_seconds", "asset_bytes", "commit", "machine", "threads"),
+        *("message", "folder"),
     ]
     assert [(row["densifier"], row["seed"]) for row in rows] == [
         ("baseline", "0"),
