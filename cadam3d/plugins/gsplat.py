@@ -24,7 +24,7 @@ from torch.optim import Optimizer
 from cadam3d.core.checks import require, require_range, require_whole
 from cadam3d.densifier.cadam import CAdam, CAdamState
 from cadam3d.plugins.opacity import reset_opacities
-from cadam3d.plugins.tracker import CAdamSettings, dense
+from cadam3d.plugins.tracker import CAdamSettings, dense, select
 
 # The rows of the state that CAdam keeps, as in CAdamState.
 MOMENTS = ("m", "v", "age")
@@ -52,10 +52,14 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
 
     # Updates before a Gaussian may be called unreliable; None for refine_every.
     reset_min_age: int | None = field(default=None, kw_only=True)
+    # CAdam grows no more than this many Gaussians, as in ``MCMCStrategy``. Its gates are relative, so that a
+    # share of the Gaussians grows at every refinement, however many there are.
+    cap_max: int = field(default=1_000_000, kw_only=True)
 
     def __post_init__(self) -> None:
         require_whole("refine_every", self.refine_every, low=1)
         require_whole("reset_every", self.reset_every, low=1)
+        require_whole("cap_max", self.cap_max, low=1)
         require_range("prune_opa", self.prune_opa, low=0, below=1 / RESET_OVER_PRUNE)
         self.cadam()
 
@@ -159,8 +163,7 @@ class CAdamStrategy(CAdamSettings, DefaultStrategy):
     def _refine(self, params: Params, optimizers: Optimizers, state: dict[str, Any], step: int) -> None:
         """Clone and split what CAdam selects, and prune, with gsplat's operations."""
         before = len(params["means"])
-        # CAdam draws nothing from the generator.
-        selected = self.cadam().select(_moments(state), step, torch.Generator())
+        selected = select(self.cadam(), _moments(state), step, self.cap_max - before)
         longest = params["scales"].exp().amax(dim=-1)
         is_large = longest > self.grow_scale3d * state["scene_scale"]
         is_cloned, is_split = selected & ~is_large, selected & is_large

@@ -85,10 +85,13 @@ class CAdamTracker(CAdamSettings):
             raise fail("observe", expected=f"a gradient of shape ({len(self)}, 3)", got=got, example=example)
         self.state = self.cadam().update(self.state, dense(gradient))
 
-    def select(self) -> Bool[Tensor, "n"]:
-        """Return the mask of Gaussians to grow (paper eq. 9 and 11). The trainer chooses how they grow."""
-        # CAdam draws nothing from the generator, and its thresholds do not depend on the step.
-        return self.cadam().select(self.state, 0, torch.Generator())
+    def select(self, most: int | None = None) -> Bool[Tensor, "n"]:
+        """Return the mask of Gaussians to grow (paper eq. 9 and 11). The trainer chooses how they grow.
+
+        With ``most``, those with the largest drifts grow, at most this many.
+        """
+        # The thresholds do not depend on the step.
+        return select(self.cadam(), self.state, 0, most)
 
     def unreliable(self) -> Bool[Tensor, "n"]:
         """Return the mask of Gaussians whose opacity a reset lowers (paper eq. 13)."""
@@ -142,6 +145,16 @@ class CAdamTracker(CAdamSettings):
         """
         device = self.state.age.device
         self.state = CAdamState(**{name: rows.to(device, copy=True) for name, rows in state.items()})
+
+
+def select(cadam: CAdam, state: CAdamState, step: int, most: int | None) -> Bool[Tensor, "n"]:
+    """Return the mask of Gaussians to grow, at most ``most`` of them: those with the largest drifts."""
+    # CAdam draws nothing from the generator.
+    selected = cadam.select(state, step, torch.Generator())
+    if most is None or int(selected.sum()) <= most:
+        return selected
+    drift = torch.where(selected, state.drift(cadam.beta1), -1.0)
+    return torch.zeros_like(selected).index_fill(0, drift.topk(max(0, most)).indices, True)
 
 
 def dense(gradient: Tensor) -> Float[Tensor, "n 3"]:

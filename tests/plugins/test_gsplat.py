@@ -435,6 +435,14 @@ def test_refinements_follow_gsplats_schedule():
     assert counts(growing(reset_every=4, pause_refine_after_reset=2)) == [10, 10, 15, 22, 22, 22, 33, 49]
 
 
+def test_growth_stops_at_cap_max_and_the_largest_drifts_grow_last():
+    assert counts(growing(cap_max=40)) == [10, 15, 22, 33, 40, 40, 40, 40]
+    toy = Toy(growing(cap_max=12))
+    toy.step(0, torch.eye(3).repeat(4, 1)[:10])
+    toy.step(1, torch.arange(10.0)[:, None].expand(-1, 3))
+    assert torch.equal(toy.params["means"][10:], toy.params["means"][[8, 9]])
+
+
 def test_faint_gaussians_are_pruned_at_refinements_and_large_ones_after_the_first_reset():
     toy = Toy(growing(tau_Q=0.9, tau_SNR=1e9, reset="none", reset_every=2, prune_scale3d=1.0))
     with torch.no_grad():
