@@ -16,10 +16,10 @@ from cadam3d.background import Background
 from cadam3d.callback.base import Callback
 from cadam3d.camera.base import CameraSampler
 from cadam3d.core.cameras import Cameras
+from cadam3d.core.contribution import contributions, ghosts
 from cadam3d.core.device import upload_together
 from cadam3d.core.edit import RowState
 from cadam3d.core.gaussians import Gaussians
-from cadam3d.core.ghosts import ghosts
 from cadam3d.core.memory import is_out_of_memory
 from cadam3d.core.rendering import RenderFn, RenderOutput
 from cadam3d.densifier.base import Densifier, GradientSignal
@@ -197,6 +197,7 @@ class Trainer:
         draws_before = generator.get_state()
         if refines:
             plan = self.densifier.plan(seen, state.gaussians, step, self.refine, generator)
+            plan = plan.without(self._idle(before))
         elif prunes:
             plan = self.refine.plan(before, plan.is_selected, step, generator, self._ghosts(before))
         state.refused = self.refine.exceeds(plan)
@@ -227,6 +228,13 @@ class Trainer:
             population=Population(gaussians=before, is_selected=plan.is_selected, scores=scores),
             edit=plan.edit,
         )
+
+    def _idle(self, gaussians: Gaussians) -> Tensor | None:
+        """Return the mask of Gaussians that a refinement prunes because they show too little, or None."""
+        if self.refine.min_contribution is None:
+            return None
+        shown = contributions(gaussians, self.rasterizer.render)
+        return shown < self.refine.min_contribution * shown.median()
 
     def _ghosts(self, gaussians: Gaussians) -> Tensor | None:
         """Return the mask of Gaussians that the last pruning removes as ghosts, or None if it keeps them."""

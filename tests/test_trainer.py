@@ -311,6 +311,18 @@ def test_the_last_pruning_removes_ghosts_and_nothing_else(tmp_path, monkeypatch)
     assert torch.equal(state.gaussians.means.detach(), kept)
 
 
+def test_every_refinement_prunes_gaussians_that_contribute_little(tmp_path, monkeypatch):
+    monkeypatch.setattr("cadam3d.trainer.contributions", lambda gaussians, _: gaussians.means[:, 0].exp())
+    trainer, state = make(["refine.min_contribution=0.5", "refine.end=9", "refine.min_opacity=0"])
+    recorder = Recorder()
+    go(replace(trainer, callbacks=[recorder]), state, tmp_path)
+    for each in recorder.refinements:
+        shown = each.population.gaussians.means[:, 0].exp()
+        idle = shown < 0.5 * shown.median()
+        assert not idle[each.edit.keep].any()
+    assert sum(each.pruned for each in recorder.refinements) > 0
+
+
 def test_a_stop_signal_ends_the_run_after_the_current_step(tmp_path):
     trainer, state = make()
     answers = iter([False, False, True])

@@ -1,6 +1,6 @@
 """HOW Gaussians are added and removed, and when; shared by all densifiers (paper sec. 3.1 and 4.4)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
@@ -33,6 +33,17 @@ class RefinePlan:
         """Return the number of Gaussians that get children."""
         return int(self.is_selected.sum())
 
+    def without(self, rows: Bool[Tensor, "n"] | None) -> "RefinePlan":
+        """Return the plan without ``rows`` of the Gaussians before it, and without children of these rows."""
+        if rows is None or self.edit is None:
+            return self
+        edit = RowEdit(
+            keep=self.edit.keep[~rows[self.edit.keep]],
+            children=self.edit.children.index(~rows[self.edit.parents]),
+            parents=self.edit.parents[~rows[self.edit.parents]],
+        )
+        return replace(self, edit=edit, pruned=self.pruned + self.edit.rows_after - edit.rows_after)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Refine(Declared):
@@ -50,6 +61,7 @@ class Refine(Declared):
     split_shrink: Annotated[float, within(low=1)]
     min_opacity: BelowOne
     max_scale: Positive | None
+    min_contribution: Share | None
     last_max_scale: Positive | None
     last_min_alpha: Share | None
     prune_from: Whole  # step

@@ -146,6 +146,7 @@ def test_growth_is_bounded_by_the_quantile_at_every_call():
         steps=100,
         last_max_scale=None,
         last_min_alpha=None,
+        min_contribution=None,
         start=0,
         end=100,
         interval=5,

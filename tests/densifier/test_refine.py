@@ -26,6 +26,7 @@ def refine(**changes) -> Refine:
         "steps": 20_000,
         "last_max_scale": None,
         "last_min_alpha": None,
+        "min_contribution": None,
         "start": 100,
         "end": 3000,
         "interval": 100,
@@ -126,6 +127,18 @@ def test_the_counts_add_up(children):
     assert plan.edit.rows_after == 60 + plan.cloned + (children - 1) * plan.split - plan.pruned
     assert plan.pruned > 0
     assert len(plan.edit.apply(scene)) == plan.edit.rows_after
+
+
+def test_a_plan_without_some_rows_has_neither_these_rows_nor_their_children():
+    plan = refine().plan(gaussians(60), some(60), LATE, draw())
+    idle = some(60, seed=2)
+    left = plan.without(idle)
+    assert not idle[left.edit.keep].any()
+    assert not idle[left.edit.parents].any()
+    kept = [*plan.edit.keep.tolist(), *plan.edit.parents.tolist()]
+    assert left.edit.rows_after == sum(not idle[row] for row in kept) < plan.edit.rows_after
+    assert left.edit.rows_after == 60 + left.cloned + left.split - left.pruned
+    assert plan.without(None) is plan
 
 
 def test_split_children_are_smaller_by_the_shrink_and_otherwise_like_their_parent():

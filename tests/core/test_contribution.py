@@ -1,9 +1,9 @@
-"""Laws of ghosts: what is alone in empty space goes, what belongs to an object stays."""
+"""Laws of contributions and ghosts: what shows counts, what is alone in empty space is a ghost."""
 
 import torch
 
+from cadam3d.core.contribution import around, contributions, ghosts
 from cadam3d.core.gaussians import Gaussians, concatenate
-from cadam3d.core.ghosts import ghosts
 from cadam3d.rasterizer.reference import ReferenceRasterizer
 
 RENDER = ReferenceRasterizer().render
@@ -46,3 +46,12 @@ def test_a_gaussian_that_no_view_shows_is_no_ghost():
     hidden = at(torch.tensor([[0.0, 0.0, 50.0]]), 0.5)
     assert not ghosts(concatenate([ball(0.8), hidden]), RENDER, 0.3).any()
     assert ghosts(at(torch.zeros(0, 3), 0.5), RENDER, 0.3).shape == (0,)
+
+
+def test_contributions_add_up_to_the_alpha_of_the_pictures_and_hidden_gaussians_have_none():
+    hidden = at(torch.zeros(1, 3), 0.9)
+    scene = concatenate([at(0.05 * torch.eye(3), 0.99, scale=0.2), hidden, ball(0.5)])
+    found = contributions(scene, RENDER)
+    assert found[3] < 0.01 * found[:3].mean()
+    alpha = [RENDER(scene, cameras, torch.zeros(len(cameras), 3)).alpha.sum() for cameras in around(4)]
+    torch.testing.assert_close(found.sum(), sum(alpha), rtol=1e-4, atol=0)
