@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from PIL import Image
 from torch import Tensor
 
@@ -30,7 +30,7 @@ class Photos:
     cameras: Cameras
     images: Float[Tensor, "v h w 3"]  # in [0, 1]
 
-    def index(self, views: Tensor) -> "Photos":
+    def index(self, views: Int[Tensor, "views"]) -> "Photos":
         """Return the chosen views."""
         return Photos(self.cameras.index(views), self.images[views])
 
@@ -40,8 +40,8 @@ class Photos:
 
     def split(self) -> tuple["Photos", "Photos"]:
         """Return the views to fit and the held-out ones."""
-        is_held_out = torch.arange(len(self.cameras)) % HOLD_OUT == 0
-        return self.index(~is_held_out), self.index(is_held_out)
+        views = torch.arange(len(self.cameras))
+        return self.index(views[views % HOLD_OUT > 0]), self.index(views[::HOLD_OUT])
 
 
 def read_data(data: str, views: int, width: int) -> tuple[Photos, Photos]:
