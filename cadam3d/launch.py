@@ -174,7 +174,7 @@ def _call(line: Line, cfg: DictConfig) -> Call:
     require(bool(text), RUN_FOLDER, expected="a folder", got=text, example=f"{RUN_FOLDER}=outputs/mine")
     with open_dict(cfg):
         return Call(
-            words=line.words,
+            words=[*line.flags, *line.words],
             hydra=cfg.pop("hydra"),
             folder=expanded(str(text)).absolute(),
             has_chosen_folder=any(key_of(override) == RUN_FOLDER for override in line.overrides),

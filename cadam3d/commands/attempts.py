@@ -43,7 +43,7 @@ def run(cfg: DictConfig, line: Line) -> int:
     attempts = [attempt_of(row) for row in rows]
     choice = choose(attempts, select)
     if choice is not None:
-        require_one_method(choice, rows, ended.folder)
+        require_one_method(choice, rows, sweep)
         _keep(choice, ended.folder)
     if not ended.was_stopped:
         try:
@@ -55,7 +55,7 @@ def run(cfg: DictConfig, line: Line) -> int:
     elif any(attempt.numbers for attempt in attempts):
         names = [each.name for each in preferred(numbers.values())] if select is None else [select]
         # The last of several needs no truth.
-        again = measuring_line(ended.folder, numbers[names[-1]])
+        again = measuring_line(sweep, numbers[names[-1]])
         raise UserError(f"select: no attempt has {' or '.join(names)}. Try: {again}")
     return ended.code
 

@@ -24,6 +24,7 @@ from cadam3d.metric.base import Measurand, Metric
 from cadam3d.prior.base import DiffusionPrior
 from cadam3d.prior.truth import TruthSource
 from cadam3d.rasterizer.base import Backend
+from cadam3d.settings.line import continuing
 from cadam3d.state import Outcome, RunContext, TrainState
 
 COMPONENTS = ("densifier", "guidance", "prior", "rasterizer", "initializer", "camera", "refine", "optimizer")
@@ -134,4 +135,4 @@ def print_result(folder: Path, summary: Mapping[str, Any]) -> None:
         if name not in (ASSET, TURNTABLE, PREVIEW):
             show(f"  {'file':<9}{shown(folder / name)}")
     if summary["outcome"] == Outcome.INTERRUPTED:
-        show(f"  continue with: cadam3d train resume={shown(folder)}")
+        show(f"  continue with: {continuing(folder)}")

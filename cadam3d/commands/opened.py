@@ -23,11 +23,11 @@ from cadam3d.io.run_folder import (
     LATEST,
     expanded,
     has_file,
-    setting_word,
     shown,
     typed_path,
 )
 from cadam3d.rasterizer.base import Rasterizer, render_fn
+from cadam3d.settings.line import continuing
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ def find_asset(folder: Path) -> Path:
     """Return the path of the asset of the run in ``folder``. Raises ``UserError`` if it has none yet."""
     ply = folder / ASSET
     if not has_file(ply):
-        line = f"{setting_word('resume', shown(folder))} 'exporter=[ply]'"
-        raise UserError(f"{shown(folder)}: has no {ASSET} yet. Try: cadam3d train {line}")
+        line = f"{continuing(folder)} 'exporter=[ply]'"
+        raise UserError(f"{shown(folder)}: has no {ASSET} yet. Try: {line}")
     return ply
 
 

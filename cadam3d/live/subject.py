@@ -25,6 +25,7 @@ from cadam3d.io.run_folder import (
     ASSET,
     CHARTS,
     CONFIG,
+    HYDRA_SETTINGS,
     LIVE_SNAPSHOT,
     LOCK,
     METRICS,
@@ -35,9 +36,8 @@ from cadam3d.io.run_folder import (
     SUMMARY,
     TURNTABLE,
     saved_name,
-    setting_word,
-    shown,
 )
+from cadam3d.settings.line import continuing
 from cadam3d.viewer.pack import pack
 
 LARGEST_SNAPSHOT = 1 << 30  # bytes; ten million Gaussians of SH degree 3 have less
@@ -101,7 +101,7 @@ class ShownRun(ShownFile):
         facts = {
             "kind": "run",
             "title": title if isinstance(title, str) else self.place.name,
-            "resume": f"cadam3d train {setting_word('resume', shown(self.place))}",
+            "resume": self._keep(HYDRA_SETTINGS, lambda: continuing(self.place)),
             "picture": self._version(LIVE_SNAPSHOT if self._shows_snapshot(now) else ASSET),
             "charts": f"{self._version(METRICS)} {self._version(CHARTS)}",
             "saved": self._saved(),

@@ -6,7 +6,7 @@ Gaussians and see the same views and noise, so settings are compared within cell
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -68,7 +68,7 @@ class Cell:
 
 @dataclass(frozen=True, kw_only=True)
 class JobResult(Row):
-    """One job with the numbers it ended with. Without a grid, its arm has the name of its densifier."""
+    """One job with the numbers it ended with."""
 
     setting: ArmSetting
     is_standard: bool  # every threshold has the value of the shipped configuration
@@ -122,7 +122,7 @@ def read(sweep_folder: Path) -> list[JobResult]:
     of the cells. A key that only differs between arms belongs to the arm. Raises ``UserError`` if
     the folder holds no sweep.
     """
-    rows = [replace(row, arm=row.arm or _densifier(row) or "default") for row in load(sweep_folder)]
+    rows = load(sweep_folder)
     of_arms: dict[str, list[Row]] = {}
     for row in rows:
         of_arms.setdefault(row.arm, []).append(row)
@@ -131,12 +131,8 @@ def read(sweep_folder: Path) -> list[JobResult]:
     return [_result(row, varied[row.arm], axes) for row in rows]
 
 
-def _densifier(row: Row) -> str:
-    return str(row.swept.get(ARM) or row.summary.get(ARM, ""))
-
-
 def _result(row: Row, varied: Sequence[str], axes: Sequence[str]) -> JobResult:
-    shipped = _shipped(_densifier(row))
+    shipped = _shipped(row.densifier)
     known = {key: row.swept.get(key, row.summary.get(key, "")) for key in BASIC}
     known |= {key: row.swept.get(key) for key in axes}
     thresholds = {key: _threshold(row.swept.get(key)) for key in varied if key.startswith(PREFIX)}

@@ -201,5 +201,5 @@ def _title(plan: Plan, results: Results) -> str:
 def _commands(plan: Plan) -> str:
     """Return the command lines of the sweep and of each job."""
     lines = [[plan.command, *plan.line]] if plan.line else []
-    lines += [["train", *job.overrides] for job in plan.jobs]
+    lines += [["train", *plan.flags, *job.overrides] for job in plan.jobs]
     return "\n".join(shlex.join(["cadam3d", *map(str, line)]) for line in lines)

@@ -40,7 +40,7 @@ SLUG_LENGTH = 60
 class Call:
     """The way in which a command was called, apart from the settings."""
 
-    words: Sequence[str]  # the overrides as they were typed
+    words: Sequence[str]  # the flags and the overrides as they were typed
     hydra: DictConfig  # Hydra's own node
     folder: Path  # of a run, as the settings name it; absolute
     has_chosen_folder: bool  # whether the line names it

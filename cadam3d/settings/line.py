@@ -3,6 +3,7 @@
 import argparse
 import os
 import re
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +12,18 @@ from omegaconf import OmegaConf
 
 from cadam3d.core.checks import require
 from cadam3d.core.errors import UserError
-from cadam3d.io.run_folder import LATEST, OVERRIDES, RUN_FOLDER, has_file, setting_word, typed_path
-from cadam3d.settings.compose import TEXT_KEYS, quote, value_of
+from cadam3d.io.records import read_config
+from cadam3d.io.run_folder import (
+    HYDRA_SETTINGS,
+    LATEST,
+    OVERRIDES,
+    RUN_FOLDER,
+    has_file,
+    setting_word,
+    shown,
+    typed_path,
+)
+from cadam3d.settings.compose import TEXT_KEYS, flatten, quote, value_of
 from cadam3d.settings.options import config_dir
 from cadam3d.settings.trust import is_trusted, judge_overrides, read_overrides, require_contained
 
@@ -55,6 +66,11 @@ class Line:
     def folders(self) -> list[Path]:
         """Return the folders of YAML files, in the order in which Hydra searches them."""
         return [Path(self.options.config_dir), config_dir()] if self.options.config_dir else [config_dir()]
+
+    @property
+    def config_flags(self) -> list[str]:
+        """Return the flag for more YAML files, which other lines about the same runs need as well."""
+        return ["--config-dir", self.options.config_dir] if self.options.config_dir else []
 
     @property
     def wants_page(self) -> bool:
@@ -151,6 +167,21 @@ def resumed(
     places = {"resume": f"resume={quote(str(path))}", RUN_FOLDER: f"{RUN_FOLDER}={quote(str(folder))}"}
     kept = [line for line in before if key_of(line) not in {*given, *places}]
     return [*kept, *(line for line in overrides if key_of(line) not in places), *places.values()]
+
+
+def continuing(folder: Path) -> str:
+    """Return the line that continues the run in ``folder``, with the flags that chose its YAML files."""
+    flags: dict[str, object] = {}
+    if has_file(folder, HYDRA_SETTINGS):
+        hydra = dict(flatten(read_config(folder / HYDRA_SETTINGS)))
+        # The folder of --config-dir is the first one in the search path.
+        paths, name = hydra.get("hydra.searchpath"), hydra.get("hydra.job.config_name")
+        if isinstance(paths, list) and paths:
+            flags["--config-dir"] = shown(Path(str(paths[0]).removeprefix("file://")))
+        if name != "train":
+            flags["--config-name"] = name
+    words = [str(word) for flag in flags.items() for word in flag]
+    return shlex.join(["cadam3d", "train", *words, f"resume={shown(folder)}"])
 
 
 def is_list(override: str) -> bool:

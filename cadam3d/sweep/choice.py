@@ -96,7 +96,7 @@ def read_attempts(cfg: DictConfig, line: Line) -> Sweep:
         digest = sweep_name(None, read_line(parts.jobs)).rpartition("_")[2]
         place = PARENT / f"{slug(str(cfg.prompt))}_{digest}"
     composed = compose_all(jobs, Composer(line.options, search_path(line.overrides)))
-    plan = plan_of(line, jobs, "train", figures=["growth"])
+    plan = plan_of(line, jobs, composed, "train", figures=["growth"])
     return Sweep(line, own, parts, folder_of(own, parts, place), plan, composed)
 
 
@@ -168,17 +168,18 @@ def require_measured(
     raise fail("select", expected=expected, got=", ".join(chosen) or "none", example=example)
 
 
-def require_one_method(choice: Choice, rows: Sequence[Row], folder: Path) -> None:
-    """Raise ``UserError`` if the numbers that a choice compares were measured in different ways."""
+def require_one_method(choice: Choice, rows: Sequence[Row], sweep: Sweep) -> None:
+    """Raise ``UserError`` if the numbers of a choice were measured in different ways."""
     name = choice.number.name
     compared = [row for row in rows if row.swept["seed"] in choice.values]
     scores = [read_scores(row.folder, row.summary).get(name) for row in compared]
     problem = difference(name, [score for score in scores if score is not None])
     if problem is not None:
-        line = measuring_line(folder, choice.number)
+        line = measuring_line(sweep, choice.number)
         raise UserError(f"select: {problem}. Try: {line}")
 
 
-def measuring_line(folder: Path, number: Number) -> str:
-    """Return the line that measures a number of all attempts in a folder."""
-    return shlex.join(["cadam3d", "eval", f"run={shown(folder)}", f"metric=[{number.metric}]"])
+def measuring_line(sweep: Sweep, number: Number) -> str:
+    """Return the line that measures a number of all attempts."""
+    words = [*sweep.line.config_flags, f"run={shown(sweep.folder)}", f"metric=[{number.metric}]"]
+    return shlex.join(["cadam3d", "eval", *words])

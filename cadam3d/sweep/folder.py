@@ -5,7 +5,7 @@ No state is kept elsewhere. However a sweep ends, its state can be read from thi
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +25,8 @@ from cadam3d.io.run_folder import JOBS, has_checkpoint
 
 # The outcome of a job that waits, runs, or has ended without a summary.
 UNFINISHED = "unfinished"
+# The arm of a job without a grid of which no densifier is known.
+UNNAMED = "default"
 # Bytes of a file name, in almost every file system.
 LONGEST_NAME = 255
 RESULTS = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.VANISHED, Outcome.OUT_OF_MEMORY)
@@ -34,7 +36,7 @@ RESULTS = (Outcome.FINISHED, Outcome.MAX_GAUSSIANS, Outcome.VANISHED, Outcome.OU
 class Job:
     """One run of a sweep."""
 
-    arm: str  # "" without a grid
+    arm: str  # of the grid; without a grid, the densifier
     name: str  # of its folder; depends only on its arm and its settings
     overrides: list[str]  # of ``cadam3d train``
     # The prompt, the seed, and the values of all other keys in which jobs of this sweep differ.
@@ -70,6 +72,11 @@ class Row(Job):
     summary: dict[str, Any] = field(repr=False)  # {} if there is none yet
 
     @property
+    def densifier(self) -> str:
+        """Return the name of its densifier; empty if that is not known."""
+        return str(self.swept.get("densifier") or self.summary.get("densifier", ""))
+
+    @property
     def outcome(self) -> str:
         """Return an :class:`~cadam3d.core.outcome.Outcome`, or ``unfinished``."""
         return self.summary.get("outcome", UNFINISHED)
@@ -96,11 +103,12 @@ def load(sweep: Path) -> list[Row]:
 
 def rows_of(sweep: Path, jobs: Sequence[Job]) -> list[Row]:
     """Return ``jobs`` with their results on disk. Jobs that have never started have an empty summary."""
-    folders = [sweep / job.name for job in jobs]
-    return [
-        Row(**vars(job), number=number, folder=folder, summary=read_summary(folder))
-        for number, (job, folder) in enumerate(zip(jobs, folders, strict=True))
+    rows = [
+        Row(**vars(job), number=number, folder=sweep / job.name, summary=read_summary(sweep / job.name))
+        for number, job in enumerate(jobs)
     ]
+    # The plan of an earlier version has no arm for a job without a grid.
+    return [row if row.arm else replace(row, arm=row.densifier or UNNAMED) for row in rows]
 
 
 def numbers_of(row: Row) -> tuple[dict[str, Number], dict[str, float], dict[str, Score]]:

@@ -17,7 +17,7 @@ from cadam3d.settings.check import require_effective, require_settings
 from cadam3d.settings.compose import compose, flatten, value_of
 from cadam3d.settings.line import DRY_RUN, LAUNCHER_KEY, SWEEP_FOLDER, Line, key_of
 from cadam3d.settings.options import with_example
-from cadam3d.sweep.folder import Job, Plan
+from cadam3d.sweep.folder import UNNAMED, Job, Plan
 from cadam3d.sweep.grid import (
     ALWAYS_SHOWN,
     Axes,
@@ -209,7 +209,7 @@ def read_sweep(line: Line) -> Sweep:
         replace(job, swept={key: settings.get(key) for key in keys})
         for job, settings in zip(jobs, composed, strict=True)
     ]
-    plan = plan_of(line, jobs, "sweep", grid.figures, grid.paper_table)
+    plan = plan_of(line, jobs, composed, "sweep", grid.figures, grid.paper_table)
     name = sweep_name(cfg.hydra.runtime.choices.get("grid"), axes, prompts)
     return Sweep(line, cfg, parts, folder_of(cfg, parts, PARENT / name), plan, composed)
 
@@ -217,18 +217,25 @@ def read_sweep(line: Line) -> Sweep:
 def plan_of(
     line: Line,
     jobs: list[Job],
+    composed: Sequence[Composed],
     command: Literal["sweep", "train"],
     figures: list[str] | None,
     paper_table: bool = False,
 ) -> Plan:
-    """Return what a worker needs to run ``jobs``, before the number of their threads is known."""
-    named = {"--config-dir": line.options.config_dir, "--config-name": line.options.config_name}
-    flags = [word for flag, value in named.items() if value for word in (flag, value)]
+    """Return what a worker needs to run ``jobs``, before the number of their threads is known.
+
+    Jobs without a grid get an arm: the densifier that they are ``composed`` with.
+    """
+    arms = [
+        job.arm or str(each.get("densifier") or UNNAMED) for job, each in zip(jobs, composed, strict=True)
+    ]
+    name = line.options.config_name
+    flags = [*line.config_flags, *(["--config-name", name] if name else [])]
     return Plan(
         cwd=str(Path.cwd()),
         flags=flags,
         threads=None,
-        jobs=jobs,
+        jobs=[replace(job, arm=arm) for job, arm in zip(jobs, arms, strict=True)],
         figures=figures,
         line=[*flags, *line.words],
         paper_table=paper_table,

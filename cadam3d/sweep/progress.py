@@ -54,7 +54,7 @@ def describe_job(row: Row, keys: Sequence[str]) -> str:
     """Describe a job in a few words: its arm, and the settings in which it differs within that arm."""
     values = {key: row.swept[key] for key in keys if row.swept.get(key) is not None}
     parts = [brief(value) if key == "prompt" else f"{key}={brief(value)}" for key, value in values.items()]
-    return ", ".join([*([row.arm] if row.arm else []), *parts]) or brief(row.swept.get("prompt"))
+    return ", ".join([row.arm, *parts])
 
 
 def describe_result(summary: Mapping[str, Any]) -> str:

@@ -150,10 +150,8 @@ def _launch(sweep: Sweep, rows: Sequence[Row]) -> str:
         return ""
     words = [*search_path(sweep.parts.grid), *sweep.parts.launcher, f"job={numbers}"]
     words += [f"{SWEEP_FOLDER}={quote(str(sweep.folder))}", "--multirun"]
-    if folder := sweep.line.options.config_dir:
-        words = ["--config-dir", folder, *words]
     try:
-        run_hydra("jobs", words, process.run)
+        run_hydra("jobs", [*sweep.line.config_flags, *words], process.run)
     except (UserError, HydraException, KeyboardInterrupt):
         raise
     except Exception as error:

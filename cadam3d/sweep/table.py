@@ -57,9 +57,8 @@ def listing(rows: Sequence[Row]) -> str:
 
 def _table(rows: Sequence[Row], columns: Mapping[str, Sequence[Any]]) -> str:
     """Return a table that begins with the number, the arm and the settings of each job."""
-    arms = {"arm": [row.arm for row in rows]} if any(row.arm for row in rows) else {}
     swept = {key: [brief(row.swept.get(key)) for row in rows] for key in varying_keys(rows)}
-    whole = {"job": [row.number for row in rows], **arms, **swept, **columns}
+    whole = {"job": [row.number for row in rows], "arm": [row.arm for row in rows], **swept, **columns}
     return aligned([list(whole), *zip(*whole.values(), strict=True)])
 
 

@@ -1,6 +1,7 @@
 """The numbers in the summary of a run are those of the files on disk."""
 
 import json
+import shlex
 import sys
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 
 from cadam3d import cli
 from cadam3d.io.ply import read_ply
+from cadam3d.settings.line import continuing
 
 SMALL = ["prompt=a red cube", "prior=tiny", "rasterizer=auto", "camera.size=8", "steps=1", "views=1"]
 SMALL += ["initializer.count=7", "metric=[size]", "callback=[]"]
@@ -76,3 +78,15 @@ def test_the_file_of_an_earlier_attempt_is_not_measured(train):
     assert (folder / "asset.ply").is_file()
     assert "asset_bytes" not in summary
     assert "asset_mib" not in summary
+
+
+def test_the_line_that_continues_a_run_names_the_folder_of_its_yaml_files(train, tmp_path):
+    (tmp_path / "my own/densifier").mkdir(parents=True)
+    (tmp_path / "my own/densifier/mine.yaml").write_text("_target_: cadam3d.densifier.none.NoGrowth\n")
+    line = ("--config-dir", "my own", "densifier=mine", "hydra.run.dir=run", "exporter=[]")
+    folder = train(*SMALL, *line, "callback=[checkpoint]")
+    program, command, *words = shlex.split(continuing(folder))
+    assert (program, command) == ("cadam3d", "train")
+    assert not (folder / "asset.ply").exists()
+    train(*words, "exporter=[ply]")
+    assert (folder / "asset.ply").is_file()

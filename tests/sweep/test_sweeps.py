@@ -2,6 +2,7 @@
 
 import csv
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -19,6 +20,7 @@ from cadam3d import cli
 from cadam3d.core.errors import UserError
 from cadam3d.io.run_folder import JOBS
 from cadam3d.launch import read_line
+from cadam3d.report.sweep_page import _commands as commands_of
 from cadam3d.settings import compose as settings
 from cadam3d.settings import options
 from cadam3d.settings.line import read_flags
@@ -142,6 +144,21 @@ def test_the_table_has_one_row_per_job(hydra_sweep):
     assert all((only_sweep() / row["folder"] / "summary.json").is_file() for row in rows)
 
 
+def test_without_a_grid_the_arm_is_the_densifier_and_no_folder_is_named_after_it(sweep):
+    assert sweep("prompt=a cube", "densifier=baseline,cadam").code == 0
+    rows = read_table(only_sweep())
+    assert [row["arm"] for row in rows] == ["baseline", "cadam"]
+    names = ["a-cube-densifier=baseline_a869c586", "a-cube-densifier=cadam_fd14050b"]
+    assert [row["folder"] for row in rows] == names
+    # Plans of earlier versions have no arms.
+    path = only_sweep() / JOBS
+    path.write_text(
+        path.read_text().replace('"arm":"cadam"', '"arm":""').replace('"arm": "cadam"', '"arm": ""')
+    )
+    assert '"arm": ""' in path.read_text()
+    assert [row.arm for row in load(only_sweep())] == ["baseline", "cadam"]
+
+
 def test_a_grid_gives_its_name_and_its_arms(sweep):
     result = sweep("prompt=a cube", "grid=densifiers", "seed=0,1")
     rows = read_table(Path("multirun/densifiers"))
@@ -198,7 +215,7 @@ def test_finished_jobs_are_skipped_and_the_others_run_again(sweep, calls):
     assert result.code == 0
     assert "3 jobs in " in result.out
     assert "2 with a result" in result.out
-    assert "[3/3] seed=1: 5 Gaussians" in result.out
+    assert "[3/3] cadam, seed=1: 5 Gaussians" in result.out
     assert [call["folder"] for call in calls(only_sweep())] == [row.folder.name for row in (*rows, rows[1])]
 
 
@@ -594,6 +611,12 @@ def test_the_plan_records_folder_flags_and_line(sweep, tmp_path):
         *("--config-dir", "own", "prompt='a cube'", "densifier=mine,none", "hydra.sweep.dir=x")
     ]
     assert [job.swept["densifier"] for job in remembered.jobs] == ["mine", "none"]
+    _, *lines = commands_of(remembered).splitlines()
+    for line, name in zip(lines, ("mypackage.Mine", "cadam3d.densifier.none.NoGrowth"), strict=True):
+        program, command, *words = shlex.split(line)
+        typed = read_line(command, words)
+        cfg = settings.compose(typed.overrides, command, typed.options)
+        assert (program, cfg.densifier["_target_"]) == ("cadam3d", name)
 
 
 def test_another_config_name_is_for_the_jobs_only(hydra_sweep, calls, small_configs):
@@ -639,7 +662,7 @@ def test_a_dry_run_lists_the_jobs_and_leaves_nothing_behind(sweep, tmp_path):
     assert result.code == 0
     lines = result.out.splitlines()
     assert lines[0].startswith("4 jobs in multirun/")
-    assert lines[2].split() == ["job", "prompt", "densifier", "state", "folder"]
+    assert lines[2].split() == ["job", "arm", "prompt", "state", "folder"]
     assert [line.split("  ")[0] for line in lines[3:7]] == ["0", "1", "2", "3"]
     assert all("to run" in line for line in lines[3:7])
     assert contents(tmp_path) == {}
