@@ -1,7 +1,7 @@
 """``cadam3d study``: write the page of a blinded comparison, or evaluate the answers of its raters."""
 
 import os
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -37,7 +37,9 @@ from cadam3d.io.text_tables import bullets
 from cadam3d.settings.compose import Call
 from cadam3d.study.answers import collect, find_files, read_files
 from cadam3d.study.clips import LEAST_VISIBLE, ClipSettings, film, ruined
+from cadam3d.study.estimates import least_units
 from cadam3d.study.key import KEY, PAGE, RESULTS, TABLE, read_key, write_key
+from cadam3d.study.questions import QUESTIONS
 from cadam3d.study.rater_page import study_id, study_page
 from cadam3d.study.runs import RunPair, StudyRun, draw_pairs, find_runs, pair_runs, select
 from cadam3d.study.trials import catch_count, make_plan
@@ -132,9 +134,29 @@ def _write_page(
     write_key(folder / KEY, study, plan, seed=cfg.seed)
     for (one, other), count in sorted(Counter(pair.arms for pair in pairs).items()):
         show(f"{one} and {other}: {count} pair(s)")
+    _note_certainty(pairs)
     show(f"{len(plan.trials)} trial(s), of which {catches} are catch trials; {len(page) / 1e6:.1f} MB")
     show(f"for the raters:  {shown(folder / PAGE)}")
     show(f"keep it secret:  {shown(folder / KEY)}")
+
+
+def _note_certainty(pairs: Sequence[RunPair]) -> None:
+    """Print how many raters a certain difference needs, or that the pairs have too few prompts for one."""
+    prompts: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for pair in pairs:
+        prompts[pair.arms].add(pair.prompt)
+    comparisons = len(QUESTIONS) * len(prompts)
+    least = least_units(comparisons)
+    needs = (
+        f"needs at least {least} raters and {least} prompts: with fewer, p >= 0.05 even if all agree, "
+        f"because it is corrected for {comparisons} comparisons"
+    )
+    arms = sorted(prompts.items())
+    few = [f"{one} and {other} ({len(known)} prompts)" for (one, other), known in arms if len(known) < least]
+    if few:
+        note(f"no difference can be certain between {', '.join(few)}. That {needs}.")
+    else:
+        show(f"A certain difference {needs}.")
 
 
 def _evaluate(cfg: DictConfig) -> None:

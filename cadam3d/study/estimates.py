@@ -123,6 +123,18 @@ def sign_test(chosen: Bool[np.ndarray, "n"], units: Int[np.ndarray, "n"]) -> flo
     return float(binomtest(wins, wins + losses).pvalue) if wins + losses else 1.0
 
 
+def least_units(comparisons: int) -> int:
+    """Return how many raters, and how many prompts, a certain difference needs at least.
+
+    The sign test of fewer units has a p-value of 0.05 or more even if all of them agree, because it is
+    corrected for ``comparisons`` (at least 1) of arms and questions.
+    """
+    units = 1
+    while comparisons * sign_test(np.ones(units, dtype=bool), np.arange(units)) >= 1 - CONFIDENCE:
+        units += 1
+    return units
+
+
 def holm(p_values: Sequence[float]) -> list[float]:
     """Return p-values that are corrected for their number, by Holm's method (1979)."""
     corrected = [0.0] * len(p_values)

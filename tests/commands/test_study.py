@@ -72,9 +72,10 @@ def fails(trial: dict, names: list[str]) -> int:
 
 
 def test_the_page_says_nothing_about_arms_files_and_counts(arms, type_line, tmp_path):
-    code, out, _ = type_line("study", arms, *SMALL)
+    code, out, err = type_line("study", arms, *SMALL)
     assert code == 0
     assert "heron and ibis: 3 pair(s)\n5 trial(s), of which 2 are catch trials" in out
+    assert "certain between heron and ibis (3 prompts). That needs at least 8 raters and 8 prompts" in err
     page = (tmp_path / "study/study.html").read_text(encoding="utf-8")
     for hidden in (
         *ARMS,

@@ -2,12 +2,15 @@
 
 import json
 from dataclasses import replace
+from itertools import combinations
 
 import pytest
 from raters import simulated_raters
 
 from cadam3d.study.analysis import Analysis, analyse, screen
 from cadam3d.study.answers import Answer, Rater
+from cadam3d.study.estimates import least_units
+from cadam3d.study.questions import QUESTION_NAMES
 
 THREE = {"a": 1.0, "b": 0.0, "c": -1.0}
 
@@ -47,6 +50,23 @@ def test_a_clear_preference_is_certain_and_a_tie_is_not():
             assert (pair.first, pair.second) == ("baseline", "cadam")
             if is_certain:
                 assert pair.rate.interval.high < 0.5
+
+
+@pytest.mark.parametrize(("arms", "least"), [("ab", 8), ("abc", 10)])
+def test_fewer_raters_or_prompts_than_the_least_are_never_certain(arms, least):
+    """All raters prefer the earlier arm, at every question."""
+    pairs = list(combinations(arms, 2))
+    assert least_units(len(QUESTION_NAMES) * len(pairs)) == least
+
+    def is_certain(raters: int, prompts: int) -> bool:
+        answers = [(str(i), name, *pair) for i in range(prompts) for name in QUESTION_NAMES for pair in pairs]
+        study = [Rater(f"{i}", tuple(Answer(f"{i}", *each) for each in answers), ()) for i in range(raters)]
+        found = analyse(study, least_caught=0.8).questions
+        return any(pair.is_certain for result in found for pair in result.comparisons)
+
+    assert is_certain(least, least)
+    assert not is_certain(least - 1, 30)
+    assert not is_certain(30, least - 1)
 
 
 def test_swapping_two_arms_mirrors_the_rates():
