@@ -60,11 +60,14 @@ class AbsGrad(Baseline):
         """Decide one refinement; with ``tau_clone``, a Gaussian's size decides which gradient counts."""
         selected = self.select(state, step, generator)
         if self.tau_clone is not None:
-            means = state.plain_sum / state.sightings.clamp_min(1)
-            is_cloned = means >= as_schedule(self.tau_clone)(step)
+            is_cloned = self._clone_norms(state) >= as_schedule(self.tau_clone)(step)
             selected = torch.where(refine.splits(gaussians.detach()), selected, is_cloned)
         return refine.plan(gaussians, selected, step, generator, self.unwanted(state))
 
     def _pulls(self, signal: GradientSignal) -> Float[Tensor, "v n 2"]:
         assert signal.absgrad is not None, "needs_absgrad requests it"
         return signal.absgrad
+
+    def _clone_norms(self, state: AbsGradState) -> Float[Tensor, "n"]:
+        """Return what decides about Gaussians that are cloned: the baseline's mean gradient norm."""
+        return state.plain_sum / state.sightings.clamp_min(1)

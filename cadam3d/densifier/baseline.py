@@ -1,5 +1,6 @@
 """3DGS adaptive density control: grow where the view-space gradient is large on average (paper eq. 1)."""
 
+from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import Annotated, TypeVar
 
@@ -31,20 +32,21 @@ class BaselineState(RowState):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Baseline(Densifier[BaselineState]):
-    """Select Gaussians whose mean gradient norm reaches a fixed threshold; a reset lowers every opacity.
+class ScreenGradients(Densifier[BaselineState]):
+    """Base of densifiers that compare mean norms of view-space gradients with a threshold.
 
     The mean is over the sightings of the Gaussian since the last refinement: over single views with
     ``views=sum_norm``, otherwise over steps. Gradients are in normalised device coordinates (image
-    half-widths), as in 3DGS and gsplat. With a loss that is a mean over pixels (``guidance.reduction=mean``)
-    the threshold then does not depend on the image size; with the other reductions, which sum over pixels, it
-    does. It always depends on the scale of the loss and of its noise (paper sec. 4.1: the dilemma).
+    half-widths), as in 3DGS and gsplat. A reset lowers every opacity.
     """
 
-    tau_pos: Positive | Schedule  # loss per NDC unit
     views: Annotated[str, one_of(VIEWS)]  # see `_norms`
     grad_multiplier: Positive
     screen_px: Positive | None  # pixels
+
+    @abstractmethod
+    def threshold(self, state: BaselineState, step: int) -> float:
+        """Return the mean norm from which a Gaussian grows, in loss per NDC unit."""
 
     def init_state(self, n: int, device: torch.device) -> BaselineState:
         """Return sums and sizes of zero."""
@@ -65,8 +67,8 @@ class Baseline(Densifier[BaselineState]):
         )
 
     def select(self, state: BaselineState, step: int, generator: torch.Generator) -> Bool[Tensor, "n"]:
-        """Return the mask of Gaussians to grow: A_i >= tau_pos (paper eq. 1; ``>=`` as in 3DGS)."""
-        return self._mean_norms(state) >= as_schedule(self.tau_pos)(step)
+        """Return the mask of Gaussians to grow: A_i >= threshold (paper eq. 1; ``>=`` as in 3DGS)."""
+        return self._mean_norms(state) >= self.threshold(state, step)
 
     def unreliable(self, state: BaselineState) -> Bool[Tensor, "n"]:
         """Return the mask of all Gaussians: the global opacity reset of 3DGS."""
@@ -81,7 +83,7 @@ class Baseline(Densifier[BaselineState]):
         return None if self.screen_px is None else state.radius > self.screen_px
 
     def scores(self, state: BaselineState) -> dict[str, Float[Tensor, "n"]]:
-        """Return the mean gradient norm, in loss per NDC unit, which is compared with ``tau_pos``."""
+        """Return the mean gradient norm, in loss per NDC unit, which is compared with the threshold."""
         return {"mean_norm": self._mean_norms(state)}
 
     def statistics(self, state: BaselineState, step: int) -> dict[str, float]:
@@ -90,7 +92,7 @@ class Baseline(Densifier[BaselineState]):
         if len(norms) == 0:
             return {}
         ordered, last = norms.sort().values, len(norms) - 1
-        tau_pos = as_schedule(self.tau_pos)(step)
+        tau_pos = self.threshold(state, step)
         return {
             "tau_pos": tau_pos,
             **{f"gradient_p{p}": float(ordered[round(last * p / 100)]) for p in (10, 50, 90)},
@@ -147,3 +149,19 @@ class Baseline(Densifier[BaselineState]):
 
     def _mean_norms(self, state: BaselineState) -> Float[Tensor, "n"]:
         return state.norm_sum / state.sightings.clamp_min(1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Baseline(ScreenGradients):
+    """Select Gaussians whose mean gradient norm reaches a fixed threshold; a reset lowers every opacity.
+
+    With a loss that is a mean over pixels (``guidance.reduction=mean``) the threshold does not depend on the
+    image size; with the other reductions, which sum over pixels, it does. It always depends on the scale of
+    the loss and of its noise (paper sec. 4.1: the dilemma).
+    """
+
+    tau_pos: Positive | Schedule  # loss per NDC unit
+
+    def threshold(self, state: BaselineState, step: int) -> float:
+        """Return ``tau_pos`` at this step."""
+        return as_schedule(self.tau_pos)(step)
