@@ -32,19 +32,21 @@ import torch
 from gsplat import DefaultStrategy
 from jaxtyping import Float
 from kornia.losses import ssim_loss
-from measuring import HERE, commit, parser_of, positive, processor
+from measuring import HERE, commit, parser_of, positive, processor, table
 from photos import Photos, photograph, read_data, seen_ball, write_transforms
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
 from cadam3d.build import component
 from cadam3d.core.cameras import Cameras
+from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.io.image import contact_sheet, write_png
 from cadam3d.io.ply import write_ply
 from cadam3d.plugins.gsplat import CAdamStrategy
 from cadam3d.rasterizer.base import Rasterizer
+from cadam3d.report.compare import hull_of, quality_at
 from cadam3d.settings.compose import compose
 
 STRATEGIES = {"default": DefaultStrategy, "cadam": CAdamStrategy}
@@ -64,7 +66,7 @@ ROWS = HERE / "docs" / "data" / "fit_images.csv"
 OBJECTS = ("cupcake", "horse", "potted plant")
 SEEDS = (0,)
 ARMS = [
-    *(f"default grow_grad2d={value}" for value in ("inf", 0.006, 0.004, 0.0025, 0.0015, 0.0008)),
+    *(f"default grow_grad2d={value}" for value in ("inf", 0.006, 0.004, 0.0025, 0.0015, 0.0008, 0.0004)),
     *(f"default absgrad=True grow_grad2d={value}" for value in (0.012, 0.005)),
     "cadam",
     *(f"cadam tau_Q={value}" for value in (0.97, 0.8)),
@@ -174,7 +176,7 @@ def psnr(images: Float[Tensor, "v h w 3"], true: Float[Tensor, "v h w 3"]) -> fl
 
 def run(args: argparse.Namespace, photos: tuple[Photos, Photos]) -> dict[str, Any]:
     """Fit the images and measure the held-out ones; returns a row of the table."""
-    train, held_out = (each.to(args.device) for each in photos)
+    train, held_out = (each.to(resolve_device(args.device)) for each in photos)
     strategy = make_strategy(args.strategy, args.settings, args.steps)
     rasterizer = component(compose(["prompt=any", f"rasterizer={args.rasterizer}"]).rasterizer)
     rasterizer.prepare(train.images.device)
@@ -198,10 +200,14 @@ def run(args: argparse.Namespace, photos: tuple[Photos, Photos]) -> dict[str, An
     }
 
 
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Return the rows of the table that there are."""
+    return list(csv.DictReader(path.open(encoding="utf-8"))) if path.is_file() else []
+
+
 def fill(path: Path, args: argparse.Namespace) -> None:
     """Append the rows of the table that the file at ``path`` lacks."""
-    rows = list(csv.DictReader(path.open(encoding="utf-8"))) if path.is_file() else []
-    done = {(row["object"], f"{row['strategy']} {row['settings']}".strip(), int(row["seed"])) for row in rows}
+    done = {(row["object"], arm_of(row), int(row["seed"])) for row in read_rows(path)}
     where = {"commit": str(commit())[:7], "machine": processor(), "threads": torch.get_num_threads()}
     photos = {name: photograph(name, args.views, args.width).split() for name in OBJECTS}
     for seed, name, arm in itertools.product(SEEDS, OBJECTS, ARMS):
@@ -216,6 +222,35 @@ def fill(path: Path, args: argparse.Namespace) -> None:
                 writer.writerow(row)
 
 
+def arm_of(row: dict[str, str]) -> str:
+    """Return the arm of a row, as in ``ARMS``."""
+    return f"{row['strategy']} {row['settings']}".strip()
+
+
+def drawn(rows: Sequence[dict[str, str]]) -> str:
+    """Return the table of the docs, with what each arm is above all settings of ``DefaultStrategy``."""
+    found: dict[str, dict[str, tuple[int, float]]] = {name: {} for name in OBJECTS}
+    for row in rows:
+        found[row["object"]][arm_of(row)] = int(row["count"]), float(row["psnr"])
+    hulls = {
+        name: hull_of(place for arm, place in places.items() if arm.startswith("default"))
+        for name, places in found.items()
+    }
+    lines = []
+    for arm in ARMS:
+        strategy, *settings = arm.split()
+        line = {"strategy": f"`{STRATEGIES[strategy].__name__}`", "settings": f"`{' '.join(settings)}`"}
+        gains = []
+        for name, hull in hulls.items():
+            count, quality = found[name][arm]
+            line[name] = f"{count:,}, {quality:.2f} dB"
+            best = quality_at(hull, count)
+            gains.append(math.nan if best is None else quality - best)
+        shown = " / ".join("-" if math.isnan(gain) else f"{gain:+.2f}" for gain in gains)
+        lines.append(line | {"above the frontier, dB": shown if strategy == "cadam" else ""})
+    return table(lines)
+
+
 def main(words: Sequence[str] | None = None) -> None:
     """Fit what the command line names, or all rows of the table."""
     parser = parser_of(__doc__)
@@ -225,7 +260,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("settings", nargs="*", help="settings of the strategy, such as tau_Q=0.95")
     parser.add_argument("--strategy", choices=list(STRATEGIES), default="cadam")
     parser.add_argument("--rasterizer", default="auto", help="as in cadam3d train; gsplat needs a GPU")
-    parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    parser.add_argument("--device", default="auto", help="as in cadam3d train")
     parser.add_argument("--steps", type=positive, default=1000)
     parser.add_argument("--count", type=positive, default=1000, help="Gaussians at the start")
     parser.add_argument("--views", type=positive, default=56, help="renders of an object")
@@ -241,6 +276,7 @@ def main(words: Sequence[str] | None = None) -> None:
     try:
         if args.table:
             fill(args.table, args)
+            print(drawn(read_rows(args.table)))
         elif args.write:
             write_transforms(args.write, photograph(args.data, args.views, args.width))
         else:

@@ -4,6 +4,7 @@ import csv
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,9 +14,12 @@ pytest.importorskip("gsplat", reason="pip install -e .[dev]")
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 import fit_images
+import gsplat_on_cpu
 import photos
 
 from cadam3d.core.errors import UserError
+from cadam3d.rasterizer import gsplat as gsplat_rasterizer
+from cadam3d.rasterizer.reference import ReferenceRasterizer
 
 SIZE = 24
 
@@ -138,6 +142,7 @@ def test_a_stopped_table_continues_with_the_rows_that_it_lacks(tmp_path, monkeyp
         }
 
     monkeypatch.setattr(fit_images, "run", run)
+    monkeypatch.setattr(fit_images, "drawn", len)
     monkeypatch.setattr(fit_images, "photograph", lambda *settings: photos.photograph("horse", 8, 4))
     monkeypatch.setattr(fit_images, "ARMS", ["cadam", "cadam tau_Q=0.8"])
     path = tmp_path / "rows.csv"
@@ -155,3 +160,41 @@ def test_the_schedule_is_scaled_and_settings_of_the_line_win():
     strategy = fit_images.make_strategy("cadam", words, 3000)
     lengths = {"refine_start_iter": 50, "refine_stop_iter": 1500, "reset_every": 300, "refine_every": 7}
     assert strategy == fit_images.CAdamStrategy(**lengths, tau_Q=0.8, tau_SNR=None, reset="none")
+
+
+def test_the_trainer_runs_with_gsplats_rasterization(monkeypatch, horse):
+    """The kernels of gsplat need a GPU, so its pure torch functions take their place."""
+    monkeypatch.setattr(gsplat_rasterizer, "load_rasterization", lambda device: gsplat_on_cpu.rasterization)
+    gaussians = []
+    for rasterizer in (gsplat_rasterizer.GsplatRasterizer(), ReferenceRasterizer()):
+        strategy = fit_images.make_strategy(
+            "default", ["absgrad=True", "grow_grad2d=0.001", "refine_every=2"], 10
+        )
+        options = SimpleNamespace(seed=0, count=30, sh_degree=1, steps=10)
+        gaussians.append(fit_images.fit(horse, strategy, rasterizer, options))
+    assert len(gaussians[0]) == len(gaussians[1]) > 30
+    images = [fit_images.shown(each, horse.cameras, ReferenceRasterizer()) for each in gaussians]
+    assert fit_images.psnr(*images) > 35
+    assert gaussians[0].sh.shape[1:] == (4, 3)
+
+
+def test_the_table_compares_with_the_best_settings_at_equal_count(monkeypatch):
+    monkeypatch.setattr(fit_images, "OBJECTS", ("horse",))
+    monkeypatch.setattr(
+        fit_images, "ARMS", ["default a=1", "default a=2", "default a=3", "cadam", "cadam b=1"]
+    )
+    places = [(100, 20.0), (1000, 21.0), (10_000, 24.0), (1000, 22.5), (90, 30.0)]
+    rows = [
+        dict(
+            zip(("strategy", "settings"), f"{arm} ".split(" ")[:2], strict=True),
+            object="horse",
+            count=n,
+            psnr=x,
+        )
+        for arm, (n, x) in zip(fit_images.ARMS, places, strict=True)
+    ]
+    lines = fit_images.drawn(rows).splitlines()
+    assert lines[3].startswith("| `DefaultStrategy` | `a=2` | 1,000, 21.00 dB |")
+    # The middle setting is below the line between the others.
+    assert lines[5].endswith("| 1,000, 22.50 dB | +0.50 |")
+    assert lines[6].endswith("| 90, 30.00 dB | - |")
