@@ -437,6 +437,7 @@ def test_refinements_follow_gsplats_schedule():
 
 def test_growth_stops_at_cap_max_and_the_largest_drifts_grow_last():
     assert counts(growing(cap_max=40)) == [10, 15, 22, 33, 40, 40, 40, 40]
+    assert counts(growing(cap_max=5)) == [10] * 8
     toy = Toy(growing(cap_max=12))
     toy.step(0, torch.eye(3).repeat(4, 1)[:10])
     toy.step(1, torch.arange(10.0)[:, None].expand(-1, 3))

@@ -58,6 +58,16 @@ def test_moments_are_those_of_the_densifier_to_the_bit():
     assert not selected.all()
 
 
+def test_of_the_selected_at_most_so_many_grow_which_have_the_largest_drifts():
+    tracker = tracker_of(noise(30, N), tau_Q=0.3)
+    selected = tracker.select()
+    best = torch.where(selected, tracker.scores()["drift"], 0.0).argsort(descending=True)
+    for most in (0, 1, int(selected.sum()) - 1):
+        assert tracker.select(most).nonzero()[:, 0].tolist() == sorted(best[:most].tolist())
+    assert torch.equal(tracker.select(N), selected)
+    assert not tracker.select(-1).any()
+
+
 def test_survivors_keep_their_history_and_newborns_start_at_zero_with_age_zero():
     tracker = tracker_of(noise(9, 5))
     # Clone the rows 1 and 4, then remove 0 and 4, as the densifier does it in one edit.
