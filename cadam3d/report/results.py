@@ -118,11 +118,17 @@ class JobResult(Row):
 def read(sweep_folder: Path) -> list[JobResult]:
     """Return every job of the sweep in ``sweep_folder``, in order, whether it is done or not.
 
-    Keys that vary within an arm are distinguished: the densifier's are thresholds, all others are axes
-    of the cells. A key that only differs between arms belongs to the arm. Raises ``UserError`` if
-    the folder holds no sweep.
+    Raises ``UserError`` if the folder holds no sweep.
     """
-    rows = load(sweep_folder)
+    return results_of(load(sweep_folder))
+
+
+def results_of(rows: Sequence[Row]) -> list[JobResult]:
+    """Return the jobs with their settings and cells.
+
+    Keys that vary within an arm are distinguished: the densifier's are thresholds, all others are axes
+    of the cells. A key that only differs between arms belongs to the arm.
+    """
     of_arms: dict[str, list[Row]] = {}
     for row in rows:
         of_arms.setdefault(row.arm, []).append(row)
@@ -132,7 +138,6 @@ def read(sweep_folder: Path) -> list[JobResult]:
 
 
 def _result(row: Row, varied: Sequence[str], axes: Sequence[str]) -> JobResult:
-    shipped = _shipped(row.densifier)
     known = {key: row.swept.get(key, row.summary.get(key, "")) for key in BASIC}
     known |= {key: row.swept.get(key) for key in axes}
     thresholds = {key: _threshold(row.swept.get(key)) for key in varied if key.startswith(PREFIX)}
@@ -143,7 +148,7 @@ def _result(row: Row, varied: Sequence[str], axes: Sequence[str]) -> JobResult:
             row.arm, tuple((key.removeprefix(PREFIX), value) for key, value in thresholds.items())
         ),
         is_standard=all(
-            _threshold(shipped.get(key)) == _threshold(value)
+            _threshold(_shipped(row.densifier).get(key)) == _threshold(value)
             for key, value in row.swept.items()
             if key.startswith(PREFIX)
         ),
