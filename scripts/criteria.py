@@ -39,7 +39,7 @@ from cadam3d.trainer import Trainer
 DATA, FIGURE = HERE / "docs/data/criteria.csv", HERE / "docs/images/criteria.png"
 # None of these is in the grids that compare densifiers, and each leaves nothing open.
 BENCH = ["experiment=bench", "prior=shapes", "prior.samples_per_pixel=1"]
-REAL = ["experiment=objects", "prior.samples_per_pixel=1", "camera.size=128", "initializer.count=600"]
+REAL = ["experiment=objects", "prior.samples_per_pixel=1", "camera.size=96", "initializer.count=400"]
 REAL += ["guidance.scale=1"]  # true colours at every level of noise
 OBJECTS = {
     "a blue and yellow checkered mug": BENCH,
@@ -53,7 +53,7 @@ NOISE = ("weak", "strong", "medium")
 PHASES = {"early": 179, "late": 399}  # steps of 600; refinements end at 450
 SHARE = 0.2  # of Gaussians, those with the largest gain, which a criterion should find
 CHOSEN = 0.1  # of Gaussians, which a criterion refines
-GROUPS, PARTITIONS = 8, 6  # of all Gaussians, at random; one trial refines one group
+GROUPS, PARTITIONS = 8, 4  # of all Gaussians, at random; one trial refines one group
 STEPS = 60  # of fine-tuning after a refinement
 VIEWS, NOISES = 24, 4  # of which the parts of the variance are estimated
 RESAMPLES = 200
