@@ -5,11 +5,13 @@ import math
 import pytest
 import torch
 
+from cadam3d.build import component
 from cadam3d.core.edit import RowEdit
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.schedule import Linear, as_schedule
 from cadam3d.densifier.base import GradientSignal
 from cadam3d.densifier.baseline import VIEWS, Baseline
+from cadam3d.settings.compose import compose
 
 CPU = torch.device("cpu")
 STEP = 100  # of a refinement; only schedules depend on it
@@ -157,3 +159,14 @@ def test_statistics_are_computed_from_the_mean_norms():
     assert numbers["gradient_p50"] == pytest.approx(5e-4)
     assert numbers["gradient_p90"] == pytest.approx(9e-4)
     assert numbers["share_above_tau_pos"] == pytest.approx(6 / 11)
+
+
+@pytest.mark.parametrize("experiment", ["bench", "objects", "luciddreamer"])
+def test_the_annealed_threshold_is_the_standard_one_when_cadams_quantile_is_half_way(experiment):
+    threshold, quantile = (
+        component(compose(["prompt=a cube", f"experiment={experiment}", f"densifier={name}"]).densifier)
+        for name in ("baseline_annealed", "cadam_annealed")
+    )
+    begin, steps = quantile.tau_Q.begin, quantile.tau_Q.steps
+    found = [threshold.tau_pos(begin + steps * share) for share in (-1, 0, 0.5, 1, 2)]
+    assert found == pytest.approx([1e-4, 1e-4, 2e-4, 4e-4, 4e-4])
