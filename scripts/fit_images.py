@@ -14,7 +14,8 @@ must surround an object.
 The strategy is gsplat's ``DefaultStrategy`` or ``CAdamStrategy``, with any settings of theirs. The schedule
 is that of 3DGS, scaled to the length of the run, with a tenth as many refinements. The rasterizer is one of
 ours, or gsplat's, which needs a GPU. ``--table`` fits three objects with every arm, one after the other, and
-appends a row to docs/data/fit_images.csv for each. The same line continues what was stopped.
+appends a row to docs/data/fit_images.csv for each. The same line continues what was stopped, and
+``scripts/make_tables.py`` then draws the table of docs/your_trainer.md.
 """
 
 import argparse
@@ -32,7 +33,7 @@ import torch
 from gsplat import DefaultStrategy
 from jaxtyping import Float
 from kornia.losses import ssim_loss
-from measuring import HERE, commit, parser_of, positive, processor, table
+from measuring import HERE, commit, parser_of, positive, processor
 from photos import Photos, photograph, read_data, seen_ball, write_transforms
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
@@ -46,7 +47,6 @@ from cadam3d.io.image import contact_sheet, write_png
 from cadam3d.io.ply import write_ply
 from cadam3d.plugins.gsplat import CAdamStrategy
 from cadam3d.rasterizer.base import Rasterizer
-from cadam3d.report.compare import hull_of, quality_at
 from cadam3d.settings.compose import compose
 
 STRATEGIES = {"default": DefaultStrategy, "cadam": CAdamStrategy}
@@ -200,14 +200,10 @@ def run(args: argparse.Namespace, photos: tuple[Photos, Photos]) -> dict[str, An
     }
 
 
-def read_rows(path: Path) -> list[dict[str, str]]:
-    """Return the rows of the table that there are."""
-    return list(csv.DictReader(path.open(encoding="utf-8"))) if path.is_file() else []
-
-
 def fill(path: Path, args: argparse.Namespace) -> None:
     """Append the rows of the table that the file at ``path`` lacks."""
-    done = {(row["object"], arm_of(row), int(row["seed"])) for row in read_rows(path)}
+    rows = list(csv.DictReader(path.open(encoding="utf-8"))) if path.is_file() else []
+    done = {(row["object"], f"{row['strategy']} {row['settings']}".strip(), int(row["seed"])) for row in rows}
     where = {"commit": str(commit())[:7], "machine": processor(), "threads": torch.get_num_threads()}
     photos = {name: photograph(name, args.views, args.width).split() for name in OBJECTS}
     for seed, name, arm in itertools.product(SEEDS, OBJECTS, ARMS):
@@ -220,35 +216,6 @@ def fill(path: Path, args: argparse.Namespace) -> None:
                 if is_new:
                     writer.writeheader()
                 writer.writerow(row)
-
-
-def arm_of(row: dict[str, str]) -> str:
-    """Return the arm of a row, as in ``ARMS``."""
-    return f"{row['strategy']} {row['settings']}".strip()
-
-
-def drawn(rows: Sequence[dict[str, str]]) -> str:
-    """Return the table of the docs, with what each arm is above all settings of ``DefaultStrategy``."""
-    found: dict[str, dict[str, tuple[int, float]]] = {name: {} for name in OBJECTS}
-    for row in rows:
-        found[row["object"]][arm_of(row)] = int(row["count"]), float(row["psnr"])
-    hulls = {
-        name: hull_of(place for arm, place in places.items() if arm.startswith("default"))
-        for name, places in found.items()
-    }
-    lines = []
-    for arm in ARMS:
-        strategy, *settings = arm.split()
-        line = {"strategy": f"`{STRATEGIES[strategy].__name__}`", "settings": f"`{' '.join(settings)}`"}
-        gains = []
-        for name, hull in hulls.items():
-            count, quality = found[name][arm]
-            line[name] = f"{count:,}, {quality:.2f} dB"
-            best = quality_at(hull, count)
-            gains.append(math.nan if best is None else quality - best)
-        shown = " / ".join("-" if math.isnan(gain) else f"{gain:+.2f}" for gain in gains)
-        lines.append(line | {"above the frontier, dB": shown if strategy == "cadam" else ""})
-    return table(lines)
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -276,7 +243,6 @@ def main(words: Sequence[str] | None = None) -> None:
     try:
         if args.table:
             fill(args.table, args)
-            print(drawn(read_rows(args.table)))
         elif args.write:
             write_transforms(args.write, photograph(args.data, args.views, args.width))
         else:

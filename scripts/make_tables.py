@@ -10,6 +10,7 @@ The first line writes a row for each finished job. The second line writes every 
 
 import csv
 import json
+import math
 import os
 import re
 import sys
@@ -34,8 +35,10 @@ from cadam3d.report.compare import (
     arms_without_growth,
     by_cell,
     compare,
+    hull_of,
     main_setting,
     qualities,
+    quality_at,
     settings_of,
     value_of,
 )
@@ -187,10 +190,21 @@ def pivot_table(drawing: Drawing, lines: Sequence[Line]) -> list[Line]:
     if drawing.arms:
         chosen = _chosen([line["result"] for line in lines], drawing.arms)
         lines = [line for line in lines if line["result"].setting in chosen]
+    if drawing.frontier:
+        lines = list(_with_above(lines, drawing.frontier))
     return [
         where | {at[drawing.columns]: _cell(drawing.cell, own) for at, own in groups(here, [drawing.columns])}
         for where, here in groups(lines, drawing.by)
     ]
+
+
+def _with_above(lines: Sequence[Line], strategy: str) -> Iterator[Line]:
+    """Yield rows of fits with ``above``, the dB above the best settings of a strategy at equal count."""
+    for _, own in groups(lines, ["object", "seed"]):
+        hull = hull_of((line["count"], line["psnr"]) for line in own if line["strategy"] == strategy)
+        for line in own:
+            best = quality_at(hull, line["count"])
+            yield {**line, "above": math.nan if best is None else line["psnr"] - best}
 
 
 def rows_table(drawing: Drawing, lines: Sequence[Line]) -> list[Line]:

@@ -34,7 +34,7 @@ class Photos:
         """Return the chosen views."""
         return Photos(self.cameras.index(views), self.images[views])
 
-    def to(self, device: str) -> "Photos":
+    def to(self, device: torch.device) -> "Photos":
         """Return the same on a device."""
         return Photos(self.cameras.to(device), self.images.to(device))
 

@@ -142,7 +142,6 @@ def test_a_stopped_table_continues_with_the_rows_that_it_lacks(tmp_path, monkeyp
         }
 
     monkeypatch.setattr(fit_images, "run", run)
-    monkeypatch.setattr(fit_images, "drawn", len)
     monkeypatch.setattr(fit_images, "photograph", lambda *settings: photos.photograph("horse", 8, 4))
     monkeypatch.setattr(fit_images, "ARMS", ["cadam", "cadam tau_Q=0.8"])
     path = tmp_path / "rows.csv"
@@ -176,25 +175,3 @@ def test_the_trainer_runs_with_gsplats_rasterization(monkeypatch, horse):
     images = [fit_images.shown(each, horse.cameras, ReferenceRasterizer()) for each in gaussians]
     assert fit_images.psnr(*images) > 35
     assert gaussians[0].sh.shape[1:] == (4, 3)
-
-
-def test_the_table_compares_with_the_best_settings_at_equal_count(monkeypatch):
-    monkeypatch.setattr(fit_images, "OBJECTS", ("horse",))
-    monkeypatch.setattr(
-        fit_images, "ARMS", ["default a=1", "default a=2", "default a=3", "cadam", "cadam b=1"]
-    )
-    places = [(100, 20.0), (1000, 21.0), (10_000, 24.0), (1000, 22.5), (90, 30.0)]
-    rows = [
-        dict(
-            zip(("strategy", "settings"), f"{arm} ".split(" ")[:2], strict=True),
-            object="horse",
-            count=n,
-            psnr=x,
-        )
-        for arm, (n, x) in zip(fit_images.ARMS, places, strict=True)
-    ]
-    lines = fit_images.drawn(rows).splitlines()
-    assert lines[3].startswith("| `DefaultStrategy` | `a=2` | 1,000, 21.00 dB |")
-    # The middle setting is below the line between the others.
-    assert lines[5].endswith("| 1,000, 22.50 dB | +0.50 |")
-    assert lines[6].endswith("| 90, 30.00 dB | - |")

@@ -136,3 +136,16 @@ def test_a_table_without_a_declaration_is_refused(page):
 def test_an_unknown_arm_is_named_with_those_that_exist(data):
     with pytest.raises(UserError, match="got cadma"):
         make_tables.text_of("mine", Drawing(data="mine", kind="settings", arms=["cadma"]), data, data)
+
+
+def test_fits_are_compared_with_the_best_settings_of_a_strategy_at_equal_count():
+    places = {"default": [(100, 20.0), (1000, 21.0), (10_000, 24.0)], "cadam": [(1000, 22.5), (90, 30.0)]}
+    lines = [
+        {"object": "horse", "strategy": name, "settings": i, "count": count, "psnr": psnr}
+        for name, own in places.items()
+        for i, (count, psnr) in enumerate(own)
+    ]
+    columns = {"by": ["strategy", "settings"], "columns": "object", "cell": "{above:+.1f}"}
+    table = make_tables.pivot_table(Drawing(data="fits", kind="pivot", frontier="default", **columns), lines)
+    # The middle setting is below the line between the others, and nothing is extrapolated.
+    assert [line["horse"] for line in table] == ["+0.0", "-1.0", "+0.0", "+0.5", "+nan"]
