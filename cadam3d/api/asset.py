@@ -30,6 +30,7 @@ from cadam3d.exporter.html import UNTITLED, HtmlExporter
 from cadam3d.exporter.images import ImagesExporter
 from cadam3d.exporter.mesh import MeshExporter
 from cadam3d.exporter.pictures import paint
+from cadam3d.exporter.ply import PlyExporter
 from cadam3d.io.asset_file import read_gaussians
 from cadam3d.io.asset_record import facts_of
 from cadam3d.io.atomic import replacing
@@ -177,6 +178,19 @@ class Asset:
             set_title(cfg, self.title)
             opened = OpenedAsset(self.gaussians, file=source, folder=source.parent)
             return [output.path for output in export(cfg, opened, "", has_record=False)]
+
+    @usual_modes()
+    def simplified(
+        self, count: int | None = None, *, fraction: float | None = None, simplify: str = "merge"
+    ) -> "Asset":
+        """Return this asset with ``count`` Gaussians, or with a ``fraction`` of them, without training.
+
+        The file formats have the same three settings, which `cadam3d export --help exporter=ply` explains.
+        An asset with fewer Gaussians stays as it is. Raises ``UserError`` for values out of range.
+        """
+        settings = {"count": plain(count), "fraction": plain(fraction), "simplify": simplify}
+        exporter: PlyExporter = option("exporter", "ply", PlyExporter, settings)
+        return replace(self, gaussians=exporter.simplified(self.gaussians, self.rasterizer.render))
 
     @usual_modes()
     def mesh(self, **settings: Any) -> "trimesh.Trimesh":

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from cadam3d.build import component
 from cadam3d.commands.messages import note
 from cadam3d.commands.opened import OpenedAsset, open_asset, renderer
 from cadam3d.commands.writing import Output, chosen_exporters, run_exporters, write_files
@@ -24,6 +25,7 @@ from cadam3d.io.run_folder import (
     shown,
     typed_path,
 )
+from cadam3d.rasterizer.base import Rasterizer
 from cadam3d.settings.compose import Call, escape
 
 
@@ -48,11 +50,13 @@ def export(cfg: DictConfig, asset: OpenedAsset, name: str, *, has_record: bool) 
     """
     exporters = chosen_exporters(cfg)
     render = renderer(cfg.rasterizer, asset.gaussians)
+    rasterizer: Rasterizer = component(cfg.rasterizer, Rasterizer, "rasterizer")
     require_apart(asset, [] if cfg.output is None else [expanded(str(cfg.output))])
 
     def into_file(folder: Path) -> list[Output]:
         def write(exporter: Exporter) -> list[Path]:
-            return exporter.export(asset.gaussians, render, folder)
+            chosen = exporter.simplified(asset.gaussians, rasterizer.render)
+            return exporter.export(chosen, render, folder)
 
         return run_exporters(exporters, asset.gaussians, write)[0]
 

@@ -60,12 +60,12 @@ class Results:
         """Export and measure ``gaussians``, and complete ``summary``, in place and on disk."""
         # The summary is written before the exports, which may fail.
         write_json(context.folder / SUMMARY, summary)
-        outputs, warnings = run_exporters(
-            self.exporters,
-            gaussians,
-            lambda exporter: exporter.export(gaussians, context.render, context.folder),
-            is_needed=False,
-        )
+
+        def write(exporter: Exporter) -> list[Path]:
+            chosen = exporter.simplified(gaussians, context.rasterizer.render)
+            return exporter.export(chosen, context.render, context.folder)
+
+        outputs, warnings = run_exporters(self.exporters, gaussians, write, is_needed=False)
         path = context.folder / ASSET
         asset = path if any(output.path == path for output in outputs) else None
         measurand = Measurand(

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 from cadam3d.core.checks import Declared, one_of, require_extra
+from cadam3d.core.contribution import RenderWithGradient
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderFn, Subject
+from cadam3d.core.simplify import Simplify
 from cadam3d.io.frames import UPS
 from cadam3d.io.gaussforge import EXTRA
 
@@ -52,6 +54,10 @@ class Exporter(Declared, ABC):
 
         ``render`` shows the same ``gaussians``. Raises ``UserError`` if a file cannot be written.
         """
+
+    def simplified(self, gaussians: Gaussians, render: RenderWithGradient) -> Gaussians:
+        """Return the Gaussians to export, by default all of ``gaussians``."""
+        return gaussians
 
     def compare(self, subjects: Sequence[Subject], folder: Path) -> list[Path]:
         """Write pictures of all ``subjects`` into ``folder``, which exists, and return the paths.
@@ -99,14 +105,13 @@ def exporters_by_suffix(classes: Mapping[str, type[Exporter]]) -> dict[str, list
     return dict(sorted(found.items()))
 
 
-def gaussians_in(gaussians: Gaussians, *, up: str | None, sh_degree: int) -> Contents:
-    """Return the contents of a file with all ``gaussians``."""
-    count = len(gaussians)
+def gaussians_in(count: int, *, up: str | None, sh_degree: int) -> Contents:
+    """Return the contents of a file with ``count`` Gaussians."""
     return Contents(words=f"{count:,} Gaussians", up=up, gaussians=count, sh_degree=sh_degree)
 
 
 @dataclass(frozen=True, kw_only=True)
-class AssetExporter(Exporter):
+class AssetExporter(Simplify, Exporter):
     """Write the Gaussians themselves as one file, in the axes that the user chooses, without a renderer."""
 
     # Writes the file, given its path, the Gaussians and ``up``; a format with settings overrides ``write``.
@@ -137,4 +142,4 @@ class AssetExporter(Exporter):
     def contents(self, path: Path, gaussians: Gaussians) -> Contents:
         """Return the number of Gaussians, their SH degree in the file, and its axes."""
         degree = gaussians.sh_degree if self.max_degree is None else min(gaussians.sh_degree, self.max_degree)
-        return gaussians_in(gaussians, up=self.up, sh_degree=degree)
+        return gaussians_in(self.size(len(gaussians)), up=self.up, sh_degree=degree)

@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 from cadam3d.core.checks import Color, Elevation, within
 from cadam3d.core.gaussians import Gaussians
 from cadam3d.core.rendering import RenderFn
+from cadam3d.core.simplify import Simplify
 from cadam3d.exporter.base import Contents, Exporter, gaussians_in
 from cadam3d.io.atomic import replacing
 from cadam3d.viewer.pack import pack
@@ -16,7 +17,7 @@ UNTITLED = "3D Gaussians"
 
 
 @dataclass(frozen=True, kw_only=True)
-class HtmlExporter(Exporter):
+class HtmlExporter(Simplify, Exporter):
     """Write ``viewer.html``, which contains the asset and everything that draws it."""
 
     files: ClassVar = ("viewer.html",)
@@ -43,4 +44,4 @@ class HtmlExporter(Exporter):
 
     def contents(self, path: Path, gaussians: Gaussians) -> Contents:
         """Return the number of Gaussians and their SH degree; a page turns them upright itself."""
-        return gaussians_in(gaussians, up=None, sh_degree=gaussians.sh_degree)
+        return gaussians_in(self.size(len(gaussians)), up=None, sh_degree=gaussians.sh_degree)

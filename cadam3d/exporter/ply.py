@@ -27,4 +27,4 @@ class PlyExporter(AssetExporter):
     def contents(self, path: Path, gaussians: Gaussians) -> Contents:
         """Return the number of Gaussians, their SH degree with the padding, and the axes of the file."""
         degree = max(gaussians.sh_degree, self.pad_sh)
-        return gaussians_in(gaussians, up=self.up, sh_degree=degree)
+        return gaussians_in(self.size(len(gaussians)), up=self.up, sh_degree=degree)

@@ -48,6 +48,16 @@ def test_a_format_that_is_exported_can_be_loaded(ball, file, name):
         assert all(torch.equal(back.tensors()[key], each) for key, each in ball.gaussians.tensors().items())
 
 
+def test_a_simplified_asset_is_what_an_export_with_the_count_has(ball, tmp_path):
+    [path] = ball.export(tmp_path / "few.ply", "exporter.ply.count=20")
+    few = ball.simplified(20)
+    assert (len(few), few.title, len(ball)) == (20, ball.title, 200)
+    assert torch.equal(load(path).gaussians.means, few.gaussians.means)
+    assert len(ball.simplified(fraction=0.5, simplify="opacity")) == 100
+    assert len(ball.simplified(40, simplify="contribution")) == 40
+    assert ball.simplified(200).gaussians is ball.gaussians
+
+
 @pytest.mark.parametrize("name", ["b.spz", "b.html", "b.compressed.ply"])
 def test_an_export_has_the_bytes_of_the_command_line(file, name, type_line):
     done = type_line(

@@ -177,6 +177,29 @@ def test_every_format_is_written_and_described_as_it_is_read_back(run_folder, ty
     assert (files["asset_mesh.glb"]["gaussians"], files["viewer.html"]["frame"]) == (None, None)
 
 
+def test_every_format_of_gaussians_can_have_fewer_and_says_so(run_folder, type_line):
+    formats = ["ply", "compressed_ply", "splat", "spz", "glb", "html"]
+    words = [f"exporter.{name}.count=4" for name in formats[:-1]]
+    words += ["exporter.html.fraction=0.3", "exporter.splat.simplify=opacity"]
+    words += ["exporter.spz.simplify=contribution", "exporter=[" + ",".join(formats) + "]"]
+    code, out, _ = type_line("export", f"run={run_folder}", *words)
+    assert code == 0
+    files = files_in(run_folder / "exports/asset.json")
+    assert [entry["gaussians"] for entry in files.values()] == [4, 4, 4, 4, 4, 2]
+    assert out.count(", 4 Gaussians") == 5
+    for name in ("asset.compressed.ply", "asset.ply", "asset.splat", "asset.spz", "asset.glb"):
+        up = files[name]["frame"]["up"]
+        assert len(read_gaussians(run_folder / "exports" / name, up=None if up == "+y" else up)) == 4
+    assert read_json(run_folder / "exports/asset.json")["source"]["gaussians"] == 6
+
+
+def test_count_beside_fraction_is_one_line(run_folder, type_line):
+    both = ("exporter.ply.count=4", "exporter.ply.fraction=0.1")
+    code, _, err = type_line("export", f"run={run_folder}", *both)
+    expected = "exporter.ply.fraction: expected null with count=4, got 0.1. Try: exporter.ply.fraction=null"
+    assert (code, err.strip()) == (1, f"cadam3d: {expected}")
+
+
 @pytest.mark.parametrize(
     ("prompt", "words", "title"),
     [

@@ -26,6 +26,8 @@ EXPORTERS = {
     "asset.ksplat": (KsplatExporter, {}),
 }
 
+ALL = {"count": None, "fraction": None, "simplify": "merge"}
+
 
 def never_renders(cameras, background):
     raise AssertionError("a file of Gaussians needs no picture")
@@ -33,7 +35,7 @@ def never_renders(cameras, background):
 
 def built(name: str, up: str = "-y", **changed) -> AssetExporter:
     kind, settings = EXPORTERS[name]
-    return kind(up=up, **{**settings, **changed})
+    return kind(up=up, **{**ALL, **settings, **changed})
 
 
 @pytest.mark.parametrize("name", EXPORTERS)

@@ -102,8 +102,8 @@ def test_a_page_contains_the_snapshot():
 
 
 def exporter(**settings):
-    values = {"title": "a cube", "azimuth_deg": 10.0, "elevation_deg": -5.0, "background": None} | settings
-    return HtmlExporter(**values)
+    values = {"title": "a cube", "azimuth_deg": 10.0, "elevation_deg": -5.0, "background": None}
+    return HtmlExporter(**values | {"count": None, "fraction": None, "simplify": "merge"} | settings)
 
 
 def never_renders(cameras, background):
