@@ -84,7 +84,12 @@ def with_base(path: Path) -> dict[str, Any]:
 
 
 NESTED = sorted((CONFIGS / "initializer").glob("*/*.yaml"))  # of groups inside a group
-VARIANTS = [path for path in FILES if "defaults" in read(path) and not nested_groups(path)]
+# What an exporter shares with others is no option.
+VARIANTS = [
+    path
+    for path in FILES
+    if "defaults" in read(path) and not nested_groups(path) and "@_here_" not in str(read(path)["defaults"])
+]
 # Options that also choose options of other groups and set values outside of their own node.
 GLOBAL = [path for path in FILES if path.read_text(encoding="utf-8").startswith("# @package _global_\n")]
 

@@ -34,7 +34,7 @@ FLATTEST = 1e-20  # square of the smallest scale of a merged Gaussian, in world 
 
 @dataclass(frozen=True, kw_only=True)
 class Simplify(Declared):
-    """How many Gaussians stay, and how they are chosen; a component with these settings inherits them."""
+    """Settings of the number of Gaussians and of the method, for components that inherit them."""
 
     count: Count | None  # None = all, or as `fraction` says
     fraction: Annotated[float, within(above=0, high=1)] | None
