@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -45,14 +46,7 @@ def build_trainer(
     The objects in ``given``, by the name of their group, replace components of ``cfg``, which are then not
     built. ``callbacks`` are called after ``cfg``'s own. Raises ``UserError`` for wrong settings.
     """
-
-    def part(name: str, kind: type) -> Any:
-        if name not in given:
-            return component(cfg[name], kind, name)
-        is_right = isinstance(given[name], kind)
-        require(is_right, name, expected=f"an object of class {kind.__name__}", got=given[name])
-        return given[name]
-
+    part = partial(chosen, cfg, given)
     refine: Refine = part("refine", Refine)
     require(
         refine.steps == cfg.steps,
@@ -77,6 +71,18 @@ def build_trainer(
         regularizers=components(cfg.regularizer, Regularizer, "regularizer"),
         callbacks=[*components(cfg.callback, Callback, "callback").values(), *callbacks],
     )
+
+
+def chosen(cfg: DictConfig, given: Mapping[str, Any], name: str, kind: type) -> Any:
+    """Return the object of a group in ``given``, or else build the component that ``cfg`` names.
+
+    Raises ``UserError`` for an object that is not of the class ``kind``.
+    """
+    if name not in given:
+        return component(cfg[name], kind, name)
+    is_right = isinstance(given[name], kind)
+    require(is_right, name, expected=f"an object of class {kind.__name__}", got=given[name])
+    return given[name]
 
 
 def component(node: Any, kind: type = object, key: str = CONFIGURATION) -> Any:

@@ -18,6 +18,8 @@ from cadam3d.core.signals import ENDING
 from cadam3d.io.jsonl import read_jsonl
 from cadam3d.io.lock import INHERITED
 from cadam3d.io.ply import read_ply
+from cadam3d.sweep import process as jobs
+from cadam3d.sweep import start as starting
 from cadam3d.sweep.folder import Row
 from cadam3d.sweep.process import run_job
 
@@ -230,8 +232,8 @@ def jobs_here(monkeypatch) -> None:
         words = [f"resume={row.folder}"] if row.has_checkpoint else []
         return cli.dispatch(["train", *words, *row.overrides, f"hydra.run.dir={row.folder}"])
 
-    monkeypatch.setattr("cadam3d.sweep.start.run_hydra", run_jobs)
-    monkeypatch.setattr("cadam3d.sweep.process._wait", run_here)
+    monkeypatch.setattr(starting, "run_hydra", run_jobs)
+    monkeypatch.setattr(jobs, "_wait", run_here)
 
 
 @pytest.mark.usefixtures("jobs_here")

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from cadam3d.api.guest import as_guest, literal, logging_messages, plain, require_free, usual_modes
+from cadam3d.api.guest import as_guest, hinting, literal, logging_messages, plain, require_free, usual_modes
 from cadam3d.build import option
 from cadam3d.commands.export import export, set_title
 from cadam3d.commands.messages import note_backend
@@ -51,6 +51,7 @@ FRAME = (
 )
 
 
+@hinting(has_words=False)
 @usual_modes()
 def load(
     path: str | os.PathLike[str], *, up: str | None = None, device: str = "auto", rasterizer: str = "auto"
@@ -102,6 +103,7 @@ class Asset:
         facts += [] if self.source is None else [f"from {shown(self.source)}"]
         return f"<Asset: {', '.join(facts)}>"
 
+    @hinting(has_words=False)
     @usual_modes()
     def render(  # noqa: PLR0913  (one argument per setting)
         self,
@@ -130,7 +132,7 @@ class Asset:
         turn["elevations_deg"] = None if elevation_deg is None else [elevation_deg]
         turn = {name: plain(value) for name, value in turn.items() if value is not None}
         if cameras is not None and turn:
-            raise fail("cameras", expected="None with settings of a turn", got=turn, example="cameras=None")
+            raise fail("cameras", expected="None with settings of a turn", got=turn, example="cameras=null")
         look = {"kinds": [kind]} | ({} if background is None else {"background": plain(background)})
         settings: ImagesExporter = option("exporter", "images", ImagesExporter, turn | look)
         if cameras is None:
@@ -145,6 +147,7 @@ class Asset:
             pictures.append(to_uint8(painted))
         return np.concatenate(pictures)
 
+    @hinting(has_words=False)
     @usual_modes()
     def rasterize(self, cameras: Cameras, background: Float[Tensor, "v 3"] | None = None) -> RenderOutput:
         """Return the exact numbers of a render, as tensors without gradient: rgb, alpha, depth and radii.
@@ -179,6 +182,7 @@ class Asset:
             opened = OpenedAsset(self.gaussians, file=source, folder=source.parent)
             return [output.path for output in export(cfg, opened, "", has_record=False)]
 
+    @hinting(has_words=False)
     @usual_modes()
     def simplified(
         self, count: int | None = None, *, fraction: float | None = None, simplify: str = "merge"
@@ -215,6 +219,7 @@ class Asset:
             process=False,
         )
 
+    @hinting(has_words=False)
     @usual_modes()
     def show(self, *, height: int = 480) -> Path | None:
         """Show the asset in the output of a notebook, to turn and to zoom; ``height`` is in pixels.

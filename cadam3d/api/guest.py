@@ -1,12 +1,17 @@
 """Guest: run a command inside somebody else's program, and leave that program as it was.
 
 The command line owns its process; a library does not. Everything of the process that training changes is
-restored here: torch's modes, and where messages go.
+restored here: torch's modes, and where messages go. What an error suggests to type is Python here.
 """
 
+import json
+import re
+import shlex
+import signal
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,9 +22,16 @@ from cadam3d.commands.beginning import messages
 from cadam3d.commands.messages import note
 from cadam3d.core.checks import fail
 from cadam3d.core.console import heard_by
-from cadam3d.settings.compose import quote
+from cadam3d.core.errors import UserError
+from cadam3d.settings.compose import quote, value_of
 from cadam3d.settings.line import QUOTED, key_of
 
+HINT = "Try: "
+# A word of a command line that sets something, or that names a folder of YAML files.
+WORD = re.compile(r"\+?[a-z][\w./@]*=.*|~[a-z][\w./@=]*", re.DOTALL)
+FLAG = "--config-dir"
+# The functions that do what a command does, and the setting that is their first argument.
+FUNCTIONS = {"train": ("train", "prompt"), "sweep": ("sweep", ""), "eval": ("evaluate", "run")}
 # Hydra has one configuration per process, so that threads take turns.
 _turn = threading.RLock()
 
@@ -32,8 +44,57 @@ def as_guest() -> Iterator[None]:
     """
     # Each call says what the user must know about it, even if an earlier one has said the same.
     note.cache_clear()
-    with _turn, logging_messages(), usual_modes():
+    with _turn, hinting(), logging_messages(), usual_modes():
         yield
+
+
+@contextmanager
+def hinting(*, has_words: bool = True) -> Iterator[None]:
+    """Suggest Python in the errors of the block, where they suggest a line or words for a shell.
+
+    ``has_words`` says that the function takes words of the command line, and not an argument per setting.
+    """
+    try:
+        yield
+    except UserError as error:
+        text, mark, hint = str(error).rpartition(HINT)
+        raise UserError(f"{text}{mark}{in_python(hint, has_words=has_words)}") from error.__cause__
+
+
+def in_python(hint: str, *, has_words: bool = True) -> str:
+    """Return what to type in Python instead of words or a line for a shell. Other hints do not change."""
+    try:
+        words = shlex.split(hint)
+    except ValueError:  # prose with an apostrophe
+        return hint
+    if words[:1] == ["cadam3d"]:
+        return _call(*words[1:]) or f"in a shell: {hint}"
+    if not words or not all(map(WORD.fullmatch, words)):
+        return hint
+    return ", ".join(_string(word) if has_words else _argument(word) for word in words)
+
+
+def _call(command: str, *words: str) -> str:
+    """Return the call that does what a line does; empty if there is none, as for a page of help."""
+    function, key = FUNCTIONS.get(command, ("", ""))
+    is_plain = all(WORD.fullmatch(word) or FLAG in (word, before) for before, word in pairwise(("", *words)))
+    if not function or not is_plain:
+        return ""
+    first = [_string(word.partition("=")[2]) for word in words if key_of(word) == key]
+    if function == "train" and not first:
+        first = ["None" if any(key_of(word) == "resume" for word in words) else "..."]
+    rest = [_string(word) for word in words if key_of(word) != key]
+    return f"cadam3d.{function}({', '.join([*first, *rest])})"
+
+
+def _argument(word: str) -> str:
+    """Return a word as an argument with a name. A run is the first argument of what reads it."""
+    key, _, text = word.partition("=")
+    return _string(text) if key == "run" else f"{key.rpartition('.')[2]}={value_of(word)!r}"
+
+
+def _string(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)
 
 
 @contextmanager
@@ -80,6 +141,11 @@ def require_free(overrides: tuple[str, ...], taken: Mapping[str, object]) -> Non
         if (key := key_of(override)) in taken:
             got = f"the argument {taken[key]!r} and {override!r}"
             raise fail(key, expected="one value", got=got, example="the argument alone")
+
+
+def stop_signals() -> tuple[int, ...]:
+    """Return the signals after which a long work saves: Ctrl-C, which only the main thread receives."""
+    return (signal.SIGINT,) if threading.current_thread() is threading.main_thread() else ()
 
 
 def plain(value: Any) -> Any:

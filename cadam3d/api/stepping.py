@@ -4,32 +4,24 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, cast
+from typing import Any, Unpack, cast
 
 import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 
 from cadam3d.api.asset import Asset
+from cadam3d.api.components import Components, given_objects
 from cadam3d.api.guest import as_guest, logging_messages, usual_modes
-from cadam3d.augmentation import Augmentation
-from cadam3d.background import Background
-from cadam3d.build import build_trainer, component
-from cadam3d.camera.base import CameraSampler
+from cadam3d.build import build_trainer, chosen
 from cadam3d.commands.beginning import deterministic, load_prior
-from cadam3d.core.checks import fail, require_whole
+from cadam3d.core.checks import require_whole
 from cadam3d.core.device import resolve_device
 from cadam3d.core.errors import UserError
 from cadam3d.core.outcome import Outcome
-from cadam3d.densifier.base import Densifier
-from cadam3d.densifier.refine import Refine
-from cadam3d.exposure import Exposure
-from cadam3d.guidance.base import Guidance
 from cadam3d.initializer.base import Initializer
 from cadam3d.launch import completing, prepare
-from cadam3d.optimizer import AdamSettings
-from cadam3d.prior.base import DiffusionPrior, PromptEmbedding
-from cadam3d.rasterizer.base import Rasterizer
+from cadam3d.prior.base import PromptEmbedding
 from cadam3d.settings.line import key_of
 from cadam3d.state import RefineReport, StepReport, TrainState
 from cadam3d.trainer import Trainer
@@ -112,49 +104,30 @@ class Stepper:
         return self.parts.prior.embed(self.prompt, self.negative_prompt)
 
 
-def compose(  # noqa: PLR0913  (one argument per component)
-    *overrides: str,
-    augmentation: Augmentation | None = None,
-    background: Background | None = None,
-    camera: CameraSampler | None = None,
-    densifier: Densifier | None = None,
-    exposure: Exposure | None = None,
-    guidance: Guidance | None = None,
-    initializer: Initializer | None = None,
-    optimizer: AdamSettings | None = None,
-    prior: DiffusionPrior | None = None,
-    rasterizer: Rasterizer | None = None,
-    refine: Refine | None = None,
-) -> Stepper:
+def compose(*overrides: str, **components: Unpack[Components]) -> Stepper:
     """Return a trainer with the settings of ``cadam3d train OVERRIDES``, to be stepped by hand.
 
     ``overrides`` are the words of the command line, without quotes for a shell; one of them must be the
     prompt, such as ``"prompt=a red cube"``. Every other argument is an object that replaces the component of
-    this name. Its settings must then not be among the overrides.
+    this name, such as ``densifier=``. Its settings must then not be among the overrides.
 
-    Raises ``UserError`` for mistakes, with the texts of the command line.
+    Raises ``UserError`` for mistakes, as :func:`cadam3d.train` does.
     """
-    given = {name: value for name, value in locals().items() if name != "overrides" and value is not None}
-    for word in overrides:
-        key = key_of(word)
-        if key.partition(".")[0] in given:
-            raise fail(key, expected="the object or its settings, not both", got=word, example=f"{key}=null")
-        if key == "resume":
+    with as_guest(), completing():
+        given = given_objects(components, overrides)
+        if any(key_of(word) == "resume" for word in overrides):
             raise UserError(
                 'resume: only a whole run continues another. Try: cadam3d.train(None, "resume=RUN")'
             )
-    with as_guest(), completing():
         cfg, _ = prepare("train", overrides)
         device = resolve_device(cfg.device)
         trainer = build_trainer(cfg, device, given)
-        if initializer is None:
-            initializer = component(cfg.initializer, Initializer, "initializer")
         return Stepper(
             prompt=cfg.prompt,
             negative_prompt=cfg.negative_prompt,
             seed=cfg.seed,
             device=device,
             config=cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True)),
-            initializer=cast(Initializer, initializer),
+            initializer=chosen(cfg, given, "initializer", Initializer),
             parts=trainer,
         )

@@ -1,15 +1,13 @@
 """Training from Python: ``train`` does what ``cadam3d train`` does, and returns the run that it has made."""
 
 import os
-import shlex
-import signal
-import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from cadam3d.api.asset import Asset, load
-from cadam3d.api.guest import as_guest, literal, require_free
+from cadam3d.api.components import Components, given_objects, record_objects
+from cadam3d.api.guest import as_guest, hinting, in_python, literal, require_free, stop_signals
 from cadam3d.callback.base import Callback
 from cadam3d.commands.opened import find_run
 from cadam3d.commands.train import optimise
@@ -17,6 +15,7 @@ from cadam3d.core.signals import StopOnSignal
 from cadam3d.io.records import read_config, read_metrics, read_summary
 from cadam3d.io.run_folder import CONFIG, REPORT, RUN_FOLDER, shown
 from cadam3d.launch import completing, prepare
+from cadam3d.settings.line import continuing
 
 
 class Run:
@@ -28,7 +27,12 @@ class Run:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         """Open the run in ``folder``. Raises ``UserError`` if the folder does not hold a run."""
-        self.folder: Path = find_run(os.fspath(folder))
+        with hinting(has_words=False):
+            self.folder: Path = find_run(os.fspath(folder))
+
+    def __fspath__(self) -> str:
+        """Return the folder, so that a run can stand for it: ``cadam3d.load(run)``."""
+        return str(self.folder)
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -59,10 +63,13 @@ class Run:
         """Return the path of the page with the object, charts and numbers, which training writes last."""
         return self.folder / REPORT
 
-    def resume(self, *overrides: str, callbacks: Sequence[Callback] = ()) -> "Run":
+    def resume(
+        self, *overrides: str, callbacks: Sequence[Callback] = (), **components: Unpack[Components]
+    ) -> "Run":
         """Continue the run in its folder, with changed settings such as ``"steps=900"``; see ``train``."""
         require_free(overrides, {"resume": self.folder})
-        return train(None, literal("resume", str(self.folder)), *overrides, callbacks=callbacks)
+        line = (literal("resume", str(self.folder)), *overrides)
+        return train(None, *line, callbacks=callbacks, **components)
 
     def __repr__(self) -> str:
         summary = self.summary
@@ -80,6 +87,7 @@ def train(
     *overrides: str,
     callbacks: Sequence[Callback] = (),
     folder: str | os.PathLike[str] | None = None,
+    **components: Unpack[Components],
 ) -> Run:
     """Train an asset for ``prompt``, and return the run.
 
@@ -90,9 +98,13 @@ def train(
     ``callbacks`` are called after the settings' own. To continue a run, pass ``"resume=FOLDER"`` and
     ``None`` as the prompt, or call :meth:`Run.resume`.
 
-    Raises ``UserError`` for mistakes, with the texts of the command line. After Ctrl-C, or the interrupt of a
-    notebook, the run saves everything as on the command line, and then ``KeyboardInterrupt`` is raised. A
-    second one stops at once. Messages go to the logger ``cadam3d.messages``.
+    Every other argument is an object that replaces the component of this name, such as ``densifier=``. The
+    settings of the run record its class and its fields. Pass it again when the run continues.
+
+    Raises ``UserError`` for mistakes, with the texts of the command line and hints in Python. After Ctrl-C,
+    or the interrupt of a notebook, the run saves everything as on the command line, and then
+    ``KeyboardInterrupt`` is raised. A second one stops at once. Messages go to the logger
+    ``cadam3d.messages``.
     """
     named = {} if prompt is None else {"prompt": prompt}
     named |= {} if folder is None else {RUN_FOLDER: os.fspath(folder)}
@@ -103,14 +115,12 @@ def train(
         for key, text in named.items()
     ]
     words += overrides
-    # Python handles signals in the main thread only.
-    is_main = threading.current_thread() is threading.main_thread()
-    stop = StopOnSignal((signal.SIGINT,) if is_main else ())
+    stop = StopOnSignal(stop_signals())
     with as_guest(), completing():
+        given = given_objects(components, overrides)
         cfg, call = prepare("train", words)
-        folder, _ = optimise(cfg, call, stop, callbacks)
-    run = Run(folder)
+        record_objects(cfg, call, given)
+        folder, _ = optimise(cfg, call, stop, callbacks, given)
     if stop.received is not None:
-        again = f"cadam3d train {shlex.quote(f'resume={shown(run.folder)}')}"
-        raise KeyboardInterrupt(f"Everything is saved. Continue with: {again}")
-    return run
+        raise KeyboardInterrupt(f"Everything is saved. Continue with: {in_python(continuing(folder))}")
+    return Run(folder)

@@ -1,14 +1,15 @@
 """``cadam3d train``: optimise an asset for a prompt and write it into a run folder."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from omegaconf import DictConfig
 
-from cadam3d.build import build_trainer, component
+from cadam3d.build import build_trainer, chosen
 from cadam3d.callback.base import Callback
 from cadam3d.commands.beginning import (
     begun,
@@ -44,12 +45,16 @@ def run(cfg: DictConfig, call: Call) -> int:
 
 
 def optimise(
-    cfg: DictConfig, call: Call, stop: StopOnSignal, callbacks: Sequence[Callback] = ()
+    cfg: DictConfig,
+    call: Call,
+    stop: StopOnSignal,
+    callbacks: Sequence[Callback] = (),
+    given: Mapping[str, Any] = MappingProxyType({}),
 ) -> tuple[Path, dict[str, Any]]:
     """Train, export, measure and report. Return the folder of the run and the content of its summary.
 
-    ``callbacks`` are called after ``cfg``'s own. Raises ``UserError`` for wrong settings, before the
-    folder changes.
+    ``callbacks`` are called after ``cfg``'s own, and the objects in ``given`` replace its components, by
+    the names of their groups. Raises ``UserError`` for wrong settings, before the folder changes.
     """
     device = resolve_device(cfg.device)
     origin = origin_on(device)  # now, because the checkout may change while the run lasts
@@ -58,9 +63,9 @@ def optimise(
         occupied(call.folder, is_chosen=call.has_chosen_folder, resume=resume) as folder,
         deterministic(device),
     ):
-        trainer = build_trainer(cfg, device, callbacks=callbacks)
+        trainer = build_trainer(cfg, device, given, callbacks)
         backend = trainer.rasterizer.prepare(device)
-        initializer = component(cfg.initializer, Initializer, "initializer")
+        initializer: Initializer = chosen(cfg, given, "initializer", Initializer)
         results = Results.of(cfg, trainer.prior)
         memory = note_memory(cfg, trainer)
         embedding = trainer.prior.embed(cfg.prompt, cfg.negative_prompt)

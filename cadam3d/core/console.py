@@ -1,7 +1,7 @@
 """Console: the one place that prints, so that no text from a stranger's file can steer the terminal.
 
 Commands show results, complain about errors, and say what they do meanwhile. A program that uses cadam3d as a
-library passes on what is said to its log instead.
+library passes on all of this to its log instead.
 """
 
 import logging
@@ -27,37 +27,39 @@ def visible(text: str) -> str:
     return INVISIBLE.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
 
 
+DELAY_S = 1.0  # before a bar appears
+
+_listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
+
+
 def show(text: str) -> None:
     """Print a result on standard output."""
-    print(visible(text), flush=True)
+    _pass_on(text, logging.INFO, lambda: print(visible(text), flush=True))
 
 
 def complain(text: str) -> None:
     """Print an error on standard error. Its further lines cannot pass for messages of ours."""
-    print(f"cadam3d: {visible(text)}".replace("\n", "\n  "), file=sys.stderr, flush=True)
-
-
-def _print(text: str, _level: int) -> None:
-    """Print a message on standard error, at once, so that a log can be followed."""
-    print(visible(text), file=sys.stderr, flush=True)
-
-
-DELAY_S = 1.0  # before a bar appears
-
-_listener: ContextVar[Listener] = ContextVar("listener", default=_print)
+    shown = f"cadam3d: {visible(text)}".replace("\n", "\n  ")
+    _pass_on(text, logging.WARNING, lambda: print(shown, file=sys.stderr, flush=True))
 
 
 def say(text: str, level: int = logging.INFO) -> None:
-    """Pass a message on to the listener, which by default prints it on standard error.
+    """Print a message on standard error, at once, so that a log can be followed.
 
     ``level`` is ``logging.WARNING`` if a user should see the message without asking for messages.
     """
-    _listener.get()(text, level)
+    _pass_on(text, level, lambda: print(visible(text), file=sys.stderr, flush=True))
+
+
+def _pass_on(text: str, level: int, otherwise: Callable[[], None]) -> None:
+    """Pass a text on to the listener; without one, do something else."""
+    listener = _listener.get()
+    otherwise() if listener is None else listener(text, level)
 
 
 @contextmanager
 def heard_by(listener: Listener) -> Iterator[None]:
-    """Replace the listener while the block runs."""
+    """Pass everything to ``listener``, and print nothing, while the block runs."""
     token = _listener.set(listener)
     try:
         yield

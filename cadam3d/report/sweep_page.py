@@ -22,7 +22,7 @@ from cadam3d.report.score_maps import declared_scores, score_figure
 from cadam3d.report.style import inline, styled, write_figure
 from cadam3d.settings.line import key_of
 from cadam3d.sweep.folder import Plan, is_sweep, load, read_plan
-from cadam3d.sweep.table import columns_of
+from cadam3d.sweep.table import records_of
 
 Results = Sequence[JobResult]
 
@@ -114,8 +114,6 @@ def write(sweep_folder: Path, baseline: str | None = None) -> Path:
     plan, results = read_plan(sweep_folder), read(sweep_folder)
     if not results:
         raise UserError(f"{sweep_folder}: expected a sweep with jobs, got none. Try: cadam3d sweep --help")
-    columns = columns_of(load(sweep_folder))
-    jobs = [dict(zip(columns, line, strict=True)) for line in zip(*columns.values(), strict=True)]
     folder = sweep_folder / FIGURES
     comparison = tables.comparison_table(results, baseline)
     medians = tables.medians_table(results)
@@ -139,7 +137,7 @@ def write(sweep_folder: Path, baseline: str | None = None) -> Path:
         figures=[(kind.title, kind.described(results), svg) for kind, svg in drawn if svg],
         early=[each for each in results if each.outcome != Outcome.FINISHED and not each.is_unfinished],
         waiting=sum(result.is_unfinished for result in results),
-        jobs=table(jobs, align_decimals=True),
+        jobs=table(records_of(load(sweep_folder)), align_decimals=True),
         commands=_commands(plan),
         files=[name for name in (TABLE, *FORMATS, FIGURES) if (sweep_folder / name).exists()],
     )

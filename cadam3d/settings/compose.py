@@ -6,6 +6,7 @@ import sys
 import unicodedata
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -75,12 +76,9 @@ def compose(
         more = [path for word in typed for path in value_of(word)]
         folders = ",".join(map(quote, [f"file://{folder.absolute()}", *more]))
         words = [*(word for word in words if word not in typed), f"{SEARCH_PATH}=[{folders}]"]
-    # The calling program may use Hydra itself.
-    outer, version = GlobalHydra.instance().hydra, VersionBase.instance().version_base
-    GlobalHydra.instance().clear()
     try:
         job = JobRuntime.instance().get("name")
-        with hydra.initialize_config_dir(str(config_dir().resolve()), job, VERSION_BASE):
+        with _restoring(), hydra.initialize_config_dir(str(config_dir().resolve()), job, VERSION_BASE):
             cfg = hydra.compose(config_name, words, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, UserError):
         raise
@@ -90,13 +88,24 @@ def compose(
             raise
         reason = " ".join(str(error).split())[:300] or type(error).__name__
         raise UserError(f"{place}: cannot be read ({reason}). Try: cadam3d {config_name} --help") from error
-    finally:
-        GlobalHydra.instance().hydra = outer
-        VersionBase.instance().version_base = version
     if flags is None:
         with open_dict(cfg):
             cfg.pop("hydra", None)
     return cfg
+
+
+@contextmanager
+def _restoring() -> Iterator[None]:
+    """Let the block use Hydra, and restore it afterwards, because the calling program may use it."""
+    outer, version = GlobalHydra.instance().hydra, VersionBase.instance().version_base
+    job = JobRuntime.instance().get("name")
+    GlobalHydra.instance().clear()
+    try:
+        yield
+    finally:
+        GlobalHydra.instance().hydra = outer
+        VersionBase.instance().version_base = version
+        JobRuntime.instance().set("name", job)
 
 
 def run_hydra(
@@ -113,10 +122,12 @@ def run_hydra(
     # Otherwise Hydra would print exceptions and exit.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
-        hydra.main(version_base=VERSION_BASE, config_path=str(config_dir()), config_name=command)(run)()
+        with _restoring():
+            hydra.main(version_base=VERSION_BASE, config_path=str(config_dir()), config_name=command)(run)()
     finally:
         sys.argv = arguments_before
-        os.environ["HYDRA_FULL_ERROR"] = switch_before or "0"
+        os.environ.pop("HYDRA_FULL_ERROR")
+        os.environ.update({} if switch_before is None else {"HYDRA_FULL_ERROR": switch_before})
 
 
 def flatten(node: object, prefix: str = "", *, with_nodes: bool = False) -> Iterator[tuple[str, object]]:

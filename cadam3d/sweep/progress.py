@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import copy_context
 from typing import Any
 
 from cadam3d.core.console import show
@@ -40,7 +41,8 @@ def reporting(rows: Sequence[Row]) -> Iterator[None]:
         while not is_over.wait(POLL_SECONDS):
             report()
 
-    thread = threading.Thread(target=watch, daemon=True)
+    # Messages of the thread go where those of the sweep go.
+    thread = threading.Thread(target=copy_context().run, args=(watch,), daemon=True)
     thread.start()
     try:
         yield

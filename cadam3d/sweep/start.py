@@ -57,11 +57,13 @@ class Ended:
     was_dry: bool = False  # nothing has run, and the folder may not exist
 
 
-def run_sweep(sweep: Sweep, on_start: Callable[[Path], None] = lambda _: None) -> Ended:
+def run_sweep(
+    sweep: Sweep, on_start: Callable[[Path], None] = lambda _: None, signals: Sequence[int] = ENDING
+) -> Ended:
     """Run a sweep until all its jobs have ended, or a signal stops it. A dry run only lists the jobs.
 
-    ``on_start`` is called with the folder before the first job starts. Raises ``UserError`` if the folder has
-    results that were made with other settings.
+    ``on_start`` is called with the folder before the first job starts, and ``signals`` stop the sweep. Raises
+    ``UserError`` if the folder has results that were made with other settings.
     """
     folder, plan = sweep.folder, sweep.plan
     _refuse_occupied(folder, sweep.folder_key)
@@ -74,7 +76,7 @@ def run_sweep(sweep: Sweep, on_start: Callable[[Path], None] = lambda _: None) -
         return Ended(folder, 0, was_dry=True)
     claim(folder, sweep.folder_key, is_chosen=True)
     lock = locked(folder / LOCK, lambda holder: in_use(folder, holder, sweep.folder_key))
-    stop = StopOnSignal(ENDING, (folder / STOP).touch)
+    stop = StopOnSignal(signals, (folder / STOP).touch)
     with lock, stop:
         (folder / STOP).unlink(missing_ok=True)
         _refuse_occupied(folder, sweep.folder_key)

@@ -102,6 +102,12 @@ def varying_keys(rows: Sequence[Row]) -> list[str]:
     ]
 
 
+def records_of(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Return the table as one dict per job."""
+    columns = columns_of(rows)
+    return [dict(zip(columns, line, strict=True)) for line in zip(*columns.values(), strict=True)]
+
+
 def columns_of(rows: Sequence[Row]) -> dict[str, Sequence[Any]]:
     """Return the columns of the table: arm, settings, outcome, numbers and folder of each job."""
     labels = {name: [getattr(row, name) for row in rows] for name in LABELS}

@@ -146,7 +146,7 @@ def test_every_component_that_is_given_is_used():
         (
             (),
             {"densifier": "cadam"},
-            r"densifier: expected an object of class Densifier, got 'cadam'\. Try: densifier=",
+            r"densifier: expected an object of class Densifier, got 'cadam'\. Try: \"densifier=cadam\"",
         ),
         ((), {"densifier": First}, "densifier: expected an object of class"),
         (

@@ -1,24 +1,23 @@
 """``cadam3d.train`` gives the bytes of the command line, and leaves the program that calls it as it was."""
 
+import ast
 import logging
 import os
+import shlex
 import signal
 import threading
-import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import hydra
 import pytest
 import torch
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.core.utils import JobRuntime
-from hydra.version import VersionBase
+from composed import composed
 from omegaconf import OmegaConf
 
 import cadam3d
-from cadam3d.api.guest import literal
+from cadam3d.api.guest import in_python, literal
+from cadam3d.build import component
 from cadam3d.settings.line import quoted, text_of
 from cadam3d.state import RunContext, StepReport, TrainState
 
@@ -97,28 +96,7 @@ class Chatter(logging.Handler):
         self.seen.append(f"{record.levelname} {record.getMessage()}")
 
 
-def process_state() -> dict[str, object]:
-    """Return what a library must not change."""
-    logger, root = logging.getLogger("cadam3d"), logging.getLogger()
-    return {
-        "version": VersionBase.instance().getbase(),
-        "job": JobRuntime.instance().get("name"),
-        "hydra": GlobalHydra.instance().hydra,
-        "config": HydraConfig.instance().cfg,
-        "resolvers": OmegaConf.create({"a": "${slug:x}"}).a,
-        "determinism": torch.get_deterministic_debug_mode(),
-        "dtype": torch.get_default_dtype(),
-        "grad": torch.is_grad_enabled(),
-        "signals": [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)],
-        "logging": (root.level, list(root.handlers), logger.level, list(logger.handlers), logger.propagate),
-        "folder": Path.cwd(),
-        "environment": dict(os.environ),
-        "warnings": list(warnings.filters),
-        "random": torch.get_rng_state().sum().item(),
-    }
-
-
-def test_the_program_of_the_caller_stays_as_it_was(run, place, tmp_path, monkeypatch, capfd):
+def test_the_program_of_the_caller_stays_as_it_was(run, tmp_path, monkeypatch, capfd, process_state):
     """The caller uses Hydra itself, has other modes of torch, and a log of its own."""
     monkeypatch.chdir(tmp_path)
     OmegaConf.register_new_resolver("slug", lambda text: f"my {text}", replace=True)
@@ -201,13 +179,18 @@ def test_a_run_resumes_itself_only(run):
     ],
     ids=lambda words: words[-1],
 )
-def test_an_error_has_the_text_of_the_command_line(words, type_line):
+def test_an_error_has_the_text_of_the_command_line_and_a_hint_in_python(words, type_line):
     Path("taken").mkdir()
     Path("taken/summary.json").write_text("{}")
     shown = type_line("train", "prompt=a red cube", *words)
     with pytest.raises(cadam3d.UserError) as caught:
         cadam3d.train("a red cube", *words)
-    assert str(caught.value) == shown.message
+    text, _, hint = shown.message.rpartition("Try: ")
+    python, _, typed = str(caught.value).rpartition("Try: ")
+    assert python == text
+    # The words of the hint are the same, as strings of Python.
+    is_page = hint.startswith("cadam3d")
+    assert typed == f"in a shell: {hint}" if is_page else ast.literal_eval(f"[{typed}]") == shlex.split(hint)
     assert [path.name for path in Path().iterdir()] == ["taken"]
 
 
@@ -223,6 +206,53 @@ def test_an_error_has_the_text_of_the_command_line(words, type_line):
 def test_what_only_python_can_get_wrong_is_refused(words, settings, message, without_type_checks):
     with pytest.raises(cadam3d.UserError, match=message):
         cadam3d.train(*words, **settings)
+
+
+@pytest.mark.parametrize(
+    ("line", "call"),
+    [
+        (("train", "prompt=a 'red' cube", "steps=3"), (("a 'red' cube", "steps=3"))),
+        (
+            ("train", "--config-dir", "my own", "resume=a run"),
+            (None, "--config-dir", "my own", "resume=a run"),
+        ),
+        (("train", "steps=3"), (..., "steps=3")),
+        (("sweep", "prompt=a,b", "exporter=[ply]"), ("prompt=a,b", "exporter=[ply]")),
+        (("eval", "metric=[clip]", "run=a run"), ("a run", "metric=[clip]")),
+    ],
+)
+def test_a_line_that_an_error_suggests_is_a_call_in_python(line, call):
+    found = ast.parse(in_python(shlex.join(["cadam3d", *line])), mode="eval").body
+    assert ast.unparse(found.func) == f"cadam3d.{line[0].replace('eval', 'evaluate')}"
+    assert tuple(map(ast.literal_eval, found.args)) == call
+
+
+@pytest.mark.parametrize("hint", ["another run", "cadam3d's page", "pip install 'x[y]'", "a=b, or df -h"])
+def test_other_hints_do_not_change(hint):
+    assert in_python(hint) == hint
+
+
+def test_a_hint_about_an_argument_names_the_argument(run):
+    with pytest.raises(cadam3d.UserError, match=r"Try: up='-y'$"):
+        cadam3d.load(run.folder / "asset.ply", up="up")
+    with pytest.raises(cadam3d.UserError, match=r'Try: "outputs/latest"$'):
+        cadam3d.Run("nowhere")
+
+
+def test_an_object_is_used_and_recorded_and_given_again_when_the_run_continues(place):
+    settings = ("densifier.tau_SNR=0", "densifier.tau_Q=0.5")
+    words = cadam3d.train("a cube", *SMALL, *settings, folder=place / "words")
+    given = component(composed("prompt=a cube", *SMALL, *settings).densifier)
+    own = tuple(word for word in SMALL if not word.startswith("densifier"))
+    stopping = [Witness(interrupts_at=2)]
+    with pytest.raises(KeyboardInterrupt, match=r'cadam3d\.train\(None, "resume=.*"\)'):
+        cadam3d.train("a cube", *own, densifier=given, callbacks=stopping, folder=place / "object")
+    run = cadam3d.Run(place / "object").resume(densifier=given)
+    assert asset_of(run) == asset_of(words) != asset_of(cadam3d.Run(place / "usual"))
+    assert run.config | {"resume": None} == words.config
+    assert run.summary["densifier"] == "CAdam"
+    with pytest.raises(TypeError, match="'densfier', expected one of augmentation, "):
+        cadam3d.train("a cube", densfier=given)
 
 
 def test_a_run_that_has_not_ended_shows_what_it_has(run, tmp_path):

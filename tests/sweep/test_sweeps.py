@@ -24,7 +24,7 @@ from cadam3d.report.sweep_page import _commands as commands_of
 from cadam3d.settings import compose as settings
 from cadam3d.settings import options
 from cadam3d.settings.line import read_flags
-from cadam3d.sweep import plan, start
+from cadam3d.sweep import plan, start, table
 from cadam3d.sweep.folder import Row, load, read_plan
 from cadam3d.sweep.process import run_job
 from cadam3d.sweep.table import write_table
@@ -198,7 +198,7 @@ def test_the_last_of_several_writers_leaves_the_latest_state(tmp_path, monkeypat
     """The table also has the result of a job that ends while the table is being written."""
     before, after = row(0, tmp_path), row(0, tmp_path, outcome="finished")
     states = iter([[before], [after], [after]])
-    monkeypatch.setattr("cadam3d.sweep.table.load", lambda folder: next(states))
+    monkeypatch.setattr(table, "load", lambda folder: next(states))
     assert write_table(tmp_path) == [after]
     assert read_table(tmp_path)[0]["outcome"] == "finished"
 
