@@ -2,9 +2,9 @@
 
     python scripts/learned_study.py multirun/learned
 
-All differences are within cells (one prompt, seed, prior and scale of guidance). A median has the 95 %
-interval of a bootstrap over prompts and the p-value of a sign test over prompts, as in the report of a sweep
-(docs/sweeps.md). PSNR is that at the best turn.
+All differences are within cells (one prompt, seed, prior and scale of guidance). A difference has its 95 %
+interval and the p-value of the signed-rank test over prompts, as in the report of a sweep (docs/sweeps.md).
+PSNR is that at the best turn.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,7 +16,6 @@ import numpy as np
 
 from cadam3d.io.records import read_metrics
 from cadam3d.report.compare import (
-    Estimate,
     Value,
     above_frontier,
     arms_without_growth,
@@ -25,6 +24,7 @@ from cadam3d.report.compare import (
     main_setting,
     settings_of,
 )
+from cadam3d.report.estimate import Estimate
 from cadam3d.report.results import JobResult, arms_of, measured, read
 
 PRIOR, SCALE, SEED = "prior", "guidance.scale", "seed"
@@ -71,11 +71,8 @@ def parts(results: Sequence[JobResult]) -> Iterator[tuple[str, list[JobResult]]]
 
 
 def written(estimate: Estimate | None, digits: int) -> str:
-    """Return a median with its interval and p-value; empty if there is none."""
-    if estimate is None:
-        return ""
-    p_value = "" if estimate.p_value is None else f", p = {estimate.p_value:.2g}"
-    return f"{estimate.written(digits)}{p_value}"
+    """Return an estimate with its interval and p-value; empty if there is none."""
+    return "" if estimate is None else f"{estimate.written(digits)}, p = {estimate.p_value:.2g}"
 
 
 def psnr(result: JobResult) -> float | None:

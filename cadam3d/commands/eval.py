@@ -1,4 +1,4 @@
-"""``cadam3d eval``: measure the quality of a finished run, or of every run of a sweep."""
+"""``cadam3d eval``: measure the quality of a finished run, or of every run of a sweep; compare two arms."""
 
 import shlex
 from collections.abc import Mapping
@@ -12,6 +12,7 @@ from cadam3d import report
 from cadam3d.build import component
 from cadam3d.commands.measuring import build_metrics, measure, rebuild_start
 from cadam3d.commands.opened import find_run, open_run, renderer
+from cadam3d.core.checks import require
 from cadam3d.core.console import complain, show
 from cadam3d.core.errors import UserError
 from cadam3d.core.gaussians import Gaussians
@@ -29,12 +30,21 @@ from cadam3d.sweep.table import as_text, write_table
 
 
 def run(cfg: DictConfig, call: Call) -> None:
-    """Measure ``run=`` and write its ``eval.json``; for a sweep, measure every job and write its report."""
+    """Measure ``run=`` and write its ``eval.json``; for a sweep, measure every job and write its report.
+
+    With ``arms=``, compare two arms of a sweep from what has been measured.
+    """
     if cfg.run is None:
         raise UserError(f"run: expected a finished run or a sweep, got nothing. Try: run={LATEST}")
     folder = typed_path(str(cfg.run))
     if folder.is_dir():
         require_contained(folder, None if cfg.trust else trusting(call))
+    if cfg.arms is not None:
+        expected, example = "a sweep, because arms= compares its arms", "run=multirun/thresholds"
+        require(is_sweep(folder), "run", expected=expected, got=str(cfg.run), example=example)
+        text, files = report.compare_two(folder, list(cfg.arms))
+        show("\n".join([text, *(str(shown(file)) for file in files)]))
+        return
     # If a model is missing, this stops with one message, instead of one for every job.
     build_metrics(cfg)
     if is_sweep(folder):

@@ -4,7 +4,10 @@ The functions here import what they need when they are called: matplotlib, SciPy
 second to load, and a command that writes no report should not wait for them.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
+
+from cadam3d.io.run_folder import FIGURES
 
 
 def write_report(folder: Path) -> Path:
@@ -44,3 +47,27 @@ def comparison(folder: Path, baseline: str | None = None) -> str:
     results = read(folder)
     lines = shown_comparison(comparison_table(results, baseline), results)
     return aligned([list(lines[0]), *(list(line.values()) for line in lines)]) if lines else ""
+
+
+def compare_two(folder: Path, names: Sequence[str]) -> tuple[str, list[Path]]:
+    """Return how the first of two arms or settings differs from the second, as text and as CSV files.
+
+    The name of an arm stands for its main setting, and a setting has the name that tables give it. Raises
+    ``UserError`` for other names, if no cell has both, and if a file cannot be written.
+    """
+    from cadam3d.report.compare import named_settings
+    from cadam3d.report.results import read
+    from cadam3d.report.tables import shown_estimates, two_settings, write
+    from cadam3d.settings.compose import slug
+    from cadam3d.sweep.table import aligned
+
+    results = read(folder)
+    ours, theirs = named_settings(results, names)
+    numbers, cells = two_settings(results, ours, theirs)
+    name = f"{slug(ours.name)}-minus-{slug(theirs.name)}"
+    files = [folder / FIGURES / f"{name}{part}.csv" for part in ("", "-cells")]
+    for file, lines in zip(files, (numbers, cells), strict=True):
+        write(file, lines)
+    lines = shown_estimates(numbers, results)
+    text = aligned([list(lines[0]), *(list(line.values()) for line in lines)])
+    return f"{ours.name} minus {theirs.name}:\n{text}", files

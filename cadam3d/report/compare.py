@@ -1,79 +1,25 @@
-"""Compare: how any two arms of a sweep differ, first within cells and then over all cells.
+"""Compare: how any two arms of a sweep differ, first within cells and then over prompts.
 
-All functions are pure. An interval comes from a bootstrap that draws prompts with all their cells, because
-the seeds, noise levels and objectives of one prompt are not independent samples. The sign test counts
-prompts.
+All functions are pure.
 """
 
 import math
+import shlex
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap, ttest_1samp
+from scipy.stats import ttest_1samp
 
+from cadam3d.core.checks import fail
 from cadam3d.core.number import Number, preferred
-from cadam3d.report.results import NOISE, PROMPT, ArmSetting, Cell, JobResult, arms_of, measured
-
-RESAMPLES = 2000
-CONFIDENCE = 0.95
-BOOTSTRAP_SEED = 0  # the same results give the same interval
-# Prompts that an interval needs. With 4, a bootstrap of the median covers the true value in only 85 % of
-# cases, and 5 cannot pass a sign test.
-LEAST_FOR_INTERVAL = 6
+from cadam3d.report.estimate import CONFIDENCE, Estimate, holm
+from cadam3d.report.formatting import number
+from cadam3d.report.results import NOISE, ArmSetting, Cell, JobResult, arms_of, at_noise, levels_of, measured
 
 Value = Callable[[JobResult], float | None]
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """The median of one value per cell, with its uncertainty."""
-
-    median: float
-    # Ends of the 95 % bootstrap interval; None with fewer than LEAST_FOR_INTERVAL prompts.
-    low: float | None
-    high: float | None
-    # Two-sided sign test of "the median is 0" over prompts; None if all values are 0.
-    p_value: float | None
-    cells: int
-    prompts: int
-
-    @classmethod
-    def of(cls, values: Mapping[Cell, float]) -> "Estimate":
-        """Return the estimate from one value per cell, of which there must be at least one."""
-        by_prompt: dict[str, list[float]] = defaultdict(list)
-        for cell, value in sorted(values.items()):  # a fixed order makes the bootstrap reproducible
-            by_prompt[cell[PROMPT]].append(value)
-        groups = list(by_prompt.values())
-        low, high = _interval(groups) if len(groups) >= LEAST_FOR_INTERVAL else (None, None)
-        middles = [float(np.median(group)) for group in groups]
-        ups, downs = sum(middle > 0 for middle in middles), sum(middle < 0 for middle in middles)
-        p_value = float(binomtest(ups, ups + downs).pvalue) if ups + downs else None
-        return cls(float(np.median(list(values.values()))), low, high, p_value, len(values), len(groups))
-
-    def written(self, digits: int) -> str:
-        """Return the median and its interval as text, such as ``+0.21 [+0.03, +0.36]``."""
-        median = f"{self.median:+.{digits}f}"
-        if self.low is None or self.high is None:
-            return median
-        return f"{median} [{self.low:+.{digits}f}, {self.high:+.{digits}f}]"
-
-
-def _interval(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
-    """Return the interval of the median of all values when whole groups are drawn."""
-    values = np.full((len(groups), max(map(len, groups))), np.nan)
-    for line, group in zip(values, groups, strict=True):
-        line[: len(group)] = group
-    found = bootstrap(
-        (np.arange(len(groups)),),
-        lambda drawn, axis: np.nanmedian(values[drawn].reshape(*drawn.shape[:-1], -1), axis=axis),
-        n_resamples=RESAMPLES,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        rng=np.random.default_rng(BOOTSTRAP_SEED),
-    ).confidence_interval
-    return float(found.low), float(found.high)
 
 
 @dataclass(frozen=True)
@@ -132,8 +78,12 @@ class PairedComparison:
 
     @property
     def count(self) -> Estimate:
-        """Return by how many percent our count exceeds theirs; -90 means that a tenth of theirs remains."""
-        return Estimate.of({ours.cell: 100 * (ours.count / theirs.count - 1) for ours, theirs in self.pairs})
+        """Return by how many percent our count exceeds theirs; -90 means that a tenth of theirs remains.
+
+        The logarithms are compared, so that exchanging the arms inverts the result.
+        """
+        ratios = {ours.cell: math.log(ours.count / theirs.count) for ours, theirs in self.pairs}
+        return Estimate.of(ratios).mapped(lambda ratio: 100 * math.expm1(ratio))
 
     @property
     def early(self) -> int:
@@ -172,15 +122,31 @@ def main_setting(results: Sequence[JobResult], arm: str) -> ArmSetting:
     return ordered[(len(ordered) - 1) // 2]
 
 
-def references(results: Sequence[JobResult], baseline: str | None = None) -> list[str]:
-    """Return the arms that others are compared with: the baseline, and the arm without growth.
+def named_settings(results: Sequence[JobResult], names: Sequence[str]) -> list[ArmSetting]:
+    """Return the two settings of these names, which have a cell in common.
 
-    The baseline is ``baseline``, or else the first arm of the sweep that adds Gaussians.
+    An arm stands for its main setting. Raises ``UserError`` for other names, and without a common cell.
+    """
+    known = {arm: main_setting(results, arm) for arm in arms_of(results)}
+    known |= {each.name: each for arm in arms_of(results) for each in settings_of(results, arm)}
+    example = shlex.quote(f"arms=[{','.join(arms_of(results)[:2])}]")
+    if len(names) != 2 or not known.keys() >= set(names):
+        raise fail("arms", expected=f"two of {', '.join(known)}", got=", ".join(names), example=example)
+    ours, theirs = (known[name] for name in names)
+    if not compare(results, ours, theirs):
+        raise fail("arms", expected="settings with a cell in common", got=", ".join(names), example=example)
+    return [ours, theirs]
+
+
+def baseline_of(results: Sequence[JobResult], baseline: str | None = None) -> str | None:
+    """Return the arm that others are compared with: ``baseline``, or else the first one that adds Gaussians.
+
+    Returns ``None`` if that arm left nothing to measure.
     """
     arms, still = arms_of(results), arms_without_growth(results)
     first = next((arm for arm in arms if arm not in still), None)
-    chosen = [baseline if baseline is not None else first, *still[:1]]
-    return [arm for arm in dict.fromkeys(chosen) if arm in arms]
+    chosen = first if baseline is None else baseline
+    return chosen if chosen in arms else None
 
 
 def arms_without_growth(results: Iterable[JobResult]) -> list[str]:
@@ -188,14 +154,59 @@ def arms_without_growth(results: Iterable[JobResult]) -> list[str]:
     return list(dict.fromkeys(result.arm for result in measured(results) if not result.grows))
 
 
+@dataclass(frozen=True)
+class CorrectedPair:
+    """The difference in quality of two arms, as one of a family of comparisons."""
+
+    noise: str
+    comparison: PairedComparison
+    number: Number  # the quality
+    difference: Estimate
+    p_value: float  # of the signed-rank test, corrected by Holm's method for all pairs of the family
+
+    @property
+    def is_certain(self) -> bool:
+        """Return whether the arms differ, with an error of at most 5 % in the whole family."""
+        return self.p_value <= 1 - CONFIDENCE
+
+
+def every_pair(results: Sequence[JobResult]) -> list[CorrectedPair]:
+    """Compare the main settings of every two arms at each noise level, by the preferred quality.
+
+    All these pairs are the family for which the p-values are corrected.
+    """
+    found = []
+    for quality in qualities(results)[:1]:
+        for level in levels_of(results):
+            here = at_noise(results, level)
+            for theirs, ours in combinations([main_setting(here, arm) for arm in arms_of(here)], 2):
+                comparison = compare(here, ours, theirs)
+                if comparison and (difference := comparison.difference(value_of(quality))):
+                    found.append(CorrectedPair(level, comparison, quality, difference, 1.0))
+    corrected = holm([pair.difference.p_value for pair in found])
+    return [replace(pair, p_value=p_value) for pair, p_value in zip(found, corrected, strict=True)]
+
+
 def qualities(results: Iterable[JobResult]) -> list[Number]:
     """Return the numbers by which assets may be chosen, the most preferred one first."""
     return preferred(result.declared[name] for result in measured(results) for name in result.numbers)
 
 
-def value_of(number: Number) -> Value:
+def could_be_certain(pairs: Sequence[CorrectedPair]) -> bool:
+    """Return whether a pair could be certain among so many, if all its prompts agreed."""
+    return any(2 * len(pairs) / 2**each.difference.prompts <= 1 - CONFIDENCE for each in pairs)
+
+
+def clock(results: Iterable[JobResult]) -> tuple[str, Value]:
+    """Return the heading and the value of the time of training: seconds of CPU if all jobs have them."""
+    has_cpu = all("cpu_seconds" in result.summary for result in measured(results))
+    key, heading = ("cpu_seconds", "CPU seconds") if has_cpu else ("seconds", "seconds")
+    return heading, lambda result: number(result.summary.get(key))
+
+
+def value_of(declared: Number) -> Value:
     """Return the function that looks up a number of a result."""
-    return lambda result: result.numbers.get(number.name)
+    return lambda result: result.numbers.get(declared.name)
 
 
 def by_cell(results: Iterable[JobResult], setting: ArmSetting) -> dict[Cell, JobResult]:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from cadam3d.core.number import Number
-from cadam3d.report.compare import Mean, change, main_setting, mean, references
+from cadam3d.report.compare import Mean, baseline_of, change, main_setting, mean
 from cadam3d.report.published import ROWS, SCORES, SIZES
 from cadam3d.report.results import GUIDANCE, PROMPT, RECIPE, SEED, Cell, JobResult, arms_of, measured
 
@@ -135,7 +135,7 @@ def _rows(results: Sequence[JobResult], numbers: Sequence[Number], category: str
 
 def _differences(jobs: Sequence[JobResult], numbers: Sequence[Number]) -> Iterator[list[str]]:
     """Yield a row for each other arm: its differences from the baseline, over what both have."""
-    for baseline in references(jobs)[:1]:
+    if baseline := baseline_of(jobs):
         for arm in (arm for arm in arms_of(jobs) if arm != baseline):
             settings = main_setting(jobs, arm), main_setting(jobs, baseline)
             ours, theirs = ([job for job in jobs if job.setting == each] for each in settings)

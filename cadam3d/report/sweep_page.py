@@ -15,9 +15,10 @@ from cadam3d.core.outcome import Outcome
 from cadam3d.io.jsonl import read_json
 from cadam3d.io.run_folder import CHOICE, FIGURES, REPORT, TABLE
 from cadam3d.report import figures, strips, tables
+from cadam3d.report.compare import could_be_certain, every_pair
 from cadam3d.report.pages import table, write_page
 from cadam3d.report.paper_formats import FORMATS, read_table
-from cadam3d.report.results import NOISE, PROMPT, JobResult, measured, objective_axis, read
+from cadam3d.report.results import NOISE, PROMPT, JobResult, arms_of, measured, objective_axis, read
 from cadam3d.report.score_maps import declared_scores, score_figure
 from cadam3d.report.style import inline, styled, write_figure
 from cadam3d.settings.line import key_of
@@ -117,8 +118,10 @@ def write(sweep_folder: Path, baseline: str | None = None) -> Path:
     folder = sweep_folder / FIGURES
     comparison = tables.comparison_table(results, baseline)
     medians = tables.medians_table(results)
+    pairs = every_pair(results) if len(arms_of(results)) > 2 else []
     tables.write(folder / "comparison.csv", comparison)
     tables.write(folder / "medians.csv", medians)
+    tables.write(folder / "pairs.csv", tables.pairs_table(pairs))
     kinds = KINDS | _scores(results)
     chosen = list(kinds) if plan.figures is None else plan.figures
     kinds |= _frontiers(results)
@@ -132,6 +135,9 @@ def write(sweep_folder: Path, baseline: str | None = None) -> Path:
         warnings=[f"figures: expected one of {', '.join(kinds)}, got {name}." for name in unknown],
         choice=_choice(sweep_folder),
         comparison=table(tables.shown_comparison(comparison, results), align_decimals=True),
+        pairs=pairs,
+        could_be_certain=could_be_certain(pairs),
+        matrix=table(tables.shown_matrix(pairs)),
         paper=read_table(sweep_folder),
         medians=table(medians, align_decimals=True),
         figures=[(kind.title, kind.described(results), svg) for kind, svg in drawn if svg],

@@ -1,6 +1,6 @@
 """Tables of a sweep as lists of plain lines, written as CSV and shown on its page and in the terminal."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,18 +9,22 @@ import numpy as np
 from cadam3d.core.number import COUNT, Number
 from cadam3d.io.text_tables import write_csv
 from cadam3d.report.compare import (
-    Estimate,
+    CorrectedPair,
+    PairedComparison,
+    Value,
     above_frontier,
     arms_without_growth,
+    baseline_of,
     by_cell,
+    clock,
     compare,
     gain_over,
     main_setting,
     qualities,
-    references,
     settings_of,
     value_of,
 )
+from cadam3d.report.estimate import Estimate
 from cadam3d.report.results import (
     ArmSetting,
     JobResult,
@@ -35,21 +39,22 @@ Line = dict[str, Any]
 
 
 def comparison_table(results: Sequence[JobResult], baseline: str | None = None) -> list[Line]:
-    """Return how every setting differs from each reference arm, by noise level.
+    """Return how every setting of the other arms differs from the baseline, by noise level.
 
     The differences are paired within cells: an :class:`Estimate` of the count in percent, of the numbers by
     which assets are chosen, and of the seconds. The last estimate compares with the best setting of the
-    reference arm at equal count, if it has several.
+    baseline at equal count, if it has several.
     """
-    against = references(results, baseline)
+    against = baseline_of(results, baseline)
+    if against is None:
+        return []
     lines = []
     for level in levels_of(results):
         here = at_noise(results, level)
-        for position, arm in enumerate(against):
-            for other in (each for each in arms_of(here) if each not in against[: position + 1]):
-                for setting in settings_of(here, other):
-                    if line := _difference(here, setting, arm):
-                        lines.append({"noise": level, **line})
+        for other in (each for each in arms_of(here) if each != against):
+            for setting in settings_of(here, other):
+                if line := _difference(here, setting, against):
+                    lines.append({"noise": level, **line})
     return _without_empty(lines)
 
 
@@ -60,28 +65,98 @@ def _difference(results: Sequence[JobResult], setting: ArmSetting, arm: str) -> 
     if found is None:
         return None
     line: Line = {"setting": setting.name, "against": found.theirs.name, "cells": len(found.pairs)}
-    line["Gaussians (%)"] = found.count
-    for quality in qualities(results):
-        line[quality.heading] = found.difference(value_of(quality))
-    line["seconds"] = found.difference(lambda result: result.seconds)
+    line |= _estimates(results, found)
     for quality in qualities(results)[:1] if len(settings) > 1 else []:
         above = above_frontier(results, setting, arm, value_of(quality))
         line[f"{quality.heading} at equal count"] = Estimate.of(above) if above else None
     return line | {"unpaired": found.unpaired or None, "ended early": found.early or None}
 
 
+def _estimates(results: Sequence[JobResult], found: PairedComparison) -> dict[str, Estimate | None]:
+    """Return how two settings differ in count, in the numbers by which assets are chosen, and in time."""
+    differences = {name: found.difference(value) for name, value in _values(results).items()}
+    return {"Gaussians (%)": found.count, **differences}
+
+
+def _values(results: Sequence[JobResult]) -> dict[str, Value]:
+    return dict([*((each.heading, value_of(each)) for each in qualities(results)), clock(results)])
+
+
+def two_settings(
+    results: Sequence[JobResult], ours: ArmSetting, theirs: ArmSetting
+) -> tuple[list[Line], list[Line]]:
+    """Return how two settings differ at each noise level: a line per number, and a line per cell.
+
+    Both lists are empty if no cell has both settings.
+    """
+    numbers: list[Line] = []
+    cells: list[Line] = []
+    for level in levels_of(results):
+        if found := compare(at_noise(results, level), ours, theirs):
+            estimates = _estimates(results, found).items()
+            numbers += [_number_line(level, name, found, each) for name, each in estimates if each]
+            cells += [_cell_line(_values(results), *pair) for pair in found.pairs]
+    return _without_empty(numbers), _without_empty(cells)
+
+
+def _number_line(level: str, name: str, found: PairedComparison, estimate: Estimate) -> Line:
+    prompts = {"prompts": estimate.prompts, "above": estimate.above, "below": estimate.below}
+    line = {"noise": level, "number": name, "difference": estimate, "cells": estimate.cells, **prompts}
+    line |= {"p (signed ranks)": estimate.p_value, "p (signs)": estimate.sign_p_value}
+    return line | {"unpaired": found.unpaired or None, "ended early": found.early or None}
+
+
+def _cell_line(values: Mapping[str, Value], ours: JobResult, theirs: JobResult) -> Line:
+    line: Line = {**dict(ours.cell.axes), "Gaussians (%)": 100 * (ours.count / theirs.count - 1)}
+    for name, value in {"Gaussians": lambda each: each.count, **values}.items():
+        pair = value(ours), value(theirs)
+        line[f"{name}: difference"] = None if None in pair else pair[0] - pair[1]
+        line |= {
+            f"{name}: {each.setting.name}": found for each, found in zip((ours, theirs), pair, strict=True)
+        }
+    return line
+
+
+def pairs_table(pairs: Sequence[CorrectedPair]) -> list[Line]:
+    """Return a line per pair of arms, with its p-value before and after the correction."""
+    lines = []
+    for each in pairs:
+        names = {"setting": each.comparison.ours.name, "against": each.comparison.theirs.name}
+        found = {each.number.heading: each.difference, "p": each.difference.p_value}
+        lines.append({"noise": each.noise, **names, "prompts": each.difference.prompts, **found})
+        lines[-1]["p corrected"] = each.p_value
+    return _without_empty(lines)
+
+
+def shown_matrix(pairs: Sequence[CorrectedPair]) -> list[Line]:
+    """Return a line per arm with its differences from the arms before it; a star marks a certain one."""
+    lines: dict[tuple[str, str], Line] = {}
+    for each in pairs:
+        ours, theirs = each.comparison.ours.name, each.comparison.theirs.name
+        line = lines.setdefault((each.noise, ours), {"noise": each.noise, "arm": ours})
+        line[f"minus {theirs}"] = each.difference.written(each.number.digits) + " *" * each.is_certain
+    return _without_empty(list(lines.values()))
+
+
 def shown_comparison(lines: Sequence[Line], results: Sequence[JobResult]) -> list[Line]:
     """Return the lines of main settings of a :func:`comparison_table`, with every estimate as text."""
+    names = {main_setting(results, arm).name for arm in arms_of(results)}
+    return shown_estimates([line for line in lines if line["setting"] in names], results)
+
+
+def shown_estimates(lines: Sequence[Line], results: Sequence[JobResult]) -> list[Line]:
+    """Return the lines with every estimate as text.
+
+    The number whose digits it has is named by its column, or by the ``number`` of its line.
+    """
     digits = {each.heading: each.digits for each in qualities(results)}
     digits |= {f"{heading} at equal count": count for heading, count in digits.items()}
-    names = {main_setting(results, arm).name for arm in arms_of(results)}
 
-    def text(key: str, value: Any) -> Any:
-        return value.written(digits.get(key, 1)) if isinstance(value, Estimate) else value
+    def text(line: Line, key: str) -> Any:
+        value = line[key]
+        return value.written(digits.get(line.get("number", key), 1)) if isinstance(value, Estimate) else value
 
-    return [
-        {key: text(key, value) for key, value in line.items()} for line in lines if line["setting"] in names
-    ]
+    return [{key: text(line, key) for key in line} for line in lines]
 
 
 def medians_table(results: Sequence[JobResult]) -> list[Line]:
@@ -115,7 +190,7 @@ def write(path: Path, lines: Sequence[Line]) -> None:
         plain.append({})
         for key, value in line.items():
             if isinstance(value, Estimate):
-                plain[-1] |= {key: value.median, f"{key}: low": value.low, f"{key}: high": value.high}
+                plain[-1] |= {key: value.value, f"{key}: low": value.low, f"{key}: high": value.high}
             else:
                 plain[-1][key] = value
     keys = list(dict.fromkeys(key for line in plain for key in line))

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from cadam3d.core.errors import UserError
+from cadam3d.report.estimate import holm
 from cadam3d.study.answers import Answer, Rater
 from cadam3d.study.estimates import (
     CONFIDENCE,
     Clusters,
     Interval,
-    holm,
     rate_interval,
     sign_test,
 )

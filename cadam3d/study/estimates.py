@@ -133,13 +133,3 @@ def least_units(comparisons: int) -> int:
     while comparisons * sign_test(np.ones(units, dtype=bool), np.arange(units)) >= 1 - CONFIDENCE:
         units += 1
     return units
-
-
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Return p-values that are corrected for their number, by Holm's method (1979)."""
-    corrected = [0.0] * len(p_values)
-    highest = 0.0
-    for rank, i in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
-        highest = max(highest, min(1.0, p_values[i] * (len(p_values) - rank)))
-        corrected[i] = highest
-    return corrected

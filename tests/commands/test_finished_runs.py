@@ -1,5 +1,6 @@
 """The commands render, export, eval and view, with a run folder, a sweep folder or a single file."""
 
+import re
 import shlex
 import shutil
 from pathlib import Path
@@ -255,6 +256,33 @@ def test_eval_of_a_sweep_measures_every_job_and_reports_those_that_fail(tmp_path
 def test_eval_of_a_sweep_without_any_asset_fails(tmp_path, type_line):
     make_sweep(tmp_path / "sweep", "a")
     assert type_line("eval", "run=sweep")[0] == 1
+
+
+def test_eval_compares_two_arms_of_a_sweep_without_measuring_them(tmp_path, type_line):
+    """Neither arm is a densifier of the package, and no job has an asset that could be measured."""
+    facts = {"outcome": "finished", "warnings": [], "seed": 0, "seconds": 2.0, "numbers": {}}
+    jobs = []
+    for i in range(7):
+        for arm, count in (("mine", 300 + i), ("other", 100)):
+            name, prompt = f"{arm}{i}", f"object {i}"
+            jobs.append(Job(arm, name, [], {"prompt": prompt, "densifier": "plugin"}))
+            (tmp_path / "sweep" / name).mkdir(parents=True)
+            summary = {**facts, "prompt": prompt, "num_gaussians": count}
+            write_json(tmp_path / "sweep" / name / "summary.json", summary)
+    write_plan(tmp_path / "sweep", Plan(cwd=str(tmp_path), flags=[], threads=None, jobs=jobs))
+    code, out, _ = type_line("eval", "run=sweep", "arms=[mine,other]")
+    assert code == 0
+    # Of the 28 means of two prompts, the third ones from both ends.
+    assert re.search(r"Gaussians \(%\) +\+203\.0 \[\+201\.0, \+205\.0\] +7 +7 +7 +0 +0\.01562 +0\.01562", out)
+    assert not (tmp_path / "sweep/eval.json").exists()
+    cells = (tmp_path / "sweep/figures/mine-minus-other-cells.csv").read_text().splitlines()
+    assert len(cells) == 1 + 7
+    assert cells[7].startswith("object 6,0,")
+    refused = type_line("eval", "run=sweep", "arms=[mine,theirs]")
+    assert refused.code == 1
+    assert "arms: expected two of mine, other, got 'mine, theirs'. Try: 'arms=[mine,other]'" in refused.err
+    refused = type_line("eval", "run=sweep/mine0", "arms=[mine,other]")
+    assert "run: expected a sweep" in refused.err
 
 
 @pytest.mark.parametrize("has_display", [True, False])

@@ -5,19 +5,24 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from cadam3d.core.errors import UserError
 from cadam3d.report.compare import (
-    Estimate,
     above_frontier,
     arms_without_growth,
+    baseline_of,
+    clock,
     compare,
+    could_be_certain,
+    every_pair,
     frontier,
     gain_over,
     hull_of,
     main_setting,
+    named_settings,
     quality_at,
-    references,
     settings_of,
 )
+from cadam3d.report.estimate import Estimate, holm, signed_rank_chances
 from cadam3d.report.results import ArmSetting, Cell, JobResult, at_noise, read
 
 OURS, THEIRS = ArmSetting("cadam"), ArmSetting("baseline")
@@ -45,10 +50,30 @@ def test_reduction_and_difference_are_paired_within_cells(jobs):
     found = compare(read(jobs.folder), OURS, THEIRS)
     assert found is not None
     assert len(found.pairs) == 3
-    assert found.count.median == pytest.approx(-75)
     difference = found.difference(psnr)
     assert difference is not None
-    assert difference.median == pytest.approx(-0.5)  # the difference of the medians would be -1
+    assert difference.value == pytest.approx(-0.525)  # the difference of the medians would be -1
+
+
+def test_exchanging_two_arms_inverts_their_comparison(jobs):
+    for i, n in enumerate((1000, 200, 400, 300, 700, 150, 120)):
+        pair(jobs, (100 + i, 20.0 + i % 3), (n, 21.0), prompt=f"object {i}")
+    one, other = (compare(read(jobs.folder), *each) for each in ((OURS, THEIRS), (THEIRS, OURS)))
+    assert one is not None
+    assert other is not None
+    for ends in (("value", "value"), ("low", "high"), ("high", "low")):
+        ratios = [1 + getattr(each.count, end) / 100 for each, end in zip((one, other), ends, strict=True)]
+        assert ratios[0] * ratios[1] == pytest.approx(1)
+        gains = [getattr(each.difference(psnr), end) for each, end in zip((one, other), ends, strict=True)]
+        assert sum(gains) == pytest.approx(0)
+
+
+def test_time_is_that_of_the_processor_if_all_jobs_have_it(jobs):
+    jobs.add("cadam", n=1, psnr=1.0, seconds=2.0, cpu_seconds=3.0)
+    heading, value = clock(read(jobs.folder))
+    assert (heading, value(read(jobs.folder)[0])) == ("CPU seconds", 3.0)
+    jobs.add("baseline", n=1, psnr=1.0, seconds=2.0)
+    assert clock(read(jobs.folder))[0] == "seconds"
 
 
 def test_a_cell_without_its_partner_is_counted_not_compared(jobs):
@@ -105,7 +130,7 @@ def test_a_setting_is_compared_with_the_best_of_the_other_arm_at_its_count(jobs)
         baseline_frontier(jobs, {0.001: (100, 10.0 + shift), 0.0002: (10000, 20.0 + shift)}, **where)
         jobs.add("cadam", f"prompt={prompt}", "seed=0", n=1000, psnr=17.5 + shift)
     found = Estimate.of(above_frontier(read(jobs.folder), OURS, "baseline", psnr))
-    assert found.median == found.low == found.high == pytest.approx(2.5)
+    assert found.value == found.low == found.high == pytest.approx(2.5)
 
 
 def test_cells_outside_the_range_are_left_out_and_not_extrapolated(jobs):
@@ -137,38 +162,85 @@ def test_noise_levels_and_objectives_do_not_count_as_prompts():
     found = Estimate.of(values)
     assert (found.cells, found.prompts, found.low) == (12, 2, None)
     assert found.p_value == pytest.approx(0.5)
+    assert found.value == 1.0
 
 
-@pytest.mark.parametrize(("prompts", "seeds", "least"), [(6, 3, 0.87), (12, 1, 0.92)])
-def test_an_interval_covers_the_truth_as_often_as_the_documentation_says(prompts, seeds, least):
-    """The truth is 0; seeds vary half as much as prompts."""
-    rng = np.random.default_rng(0)
-    hits = 0
-    for _ in range(400):
-        values = {}
-        for prompt in range(prompts):
-            middle = rng.standard_normal()
-            for seed in range(seeds):
-                values[cell(str(prompt), seed)] = float(middle + 0.5 * (seeds > 1) * rng.standard_normal())
-        found = Estimate.of(values)
-        assert found.low is not None
-        assert found.high is not None
-        hits += found.low <= 0 <= found.high
-    assert hits >= least * 400
+def values_of(*prompts: float) -> dict[Cell, float]:
+    return {cell(f"object {i}", 0): value for i, value in enumerate(prompts)}
 
 
-def test_the_sign_test_counts_prompts_and_leaves_out_those_without_a_difference():
-    far = {cell(prompt, 0): 1.0 for prompt in "abcdefgh"}
-    assert Estimate.of(far).p_value == pytest.approx(2 / 2**8)
-    one_against = Estimate.of({**far, cell("h", 0): -1.0})
-    assert one_against.low == 1.0
-    assert one_against.p_value == pytest.approx(2 * 9 / 2**8)
-    assert Estimate.of(dict.fromkeys(far, 0.0)).p_value is None
+def test_an_estimate_has_the_numbers_of_the_published_signed_rank_tables():
+    """Of 12 prompts, 13 is the largest sum of ranks with a two-sided p of at most 0.05 (Wilcoxon, 1945)."""
+    chances = signed_rank_chances(12)
+    assert 2 * chances[13] <= 0.05 < 2 * chances[14]
+    assert chances[-1] == 1
+    found = Estimate.of(values_of(1.0, -2.0, 3.0, -4.0, *range(5, 13)))
+    assert found.p_value == pytest.approx(2 * chances[2 + 4])
+    assert (found.above, found.below) == (10, 2)
+    assert found.sign_p_value == pytest.approx(2 * (1 + 12 + 66) / 2**12)
 
 
-def test_the_same_results_give_the_same_interval():
+@pytest.mark.parametrize("shift", [-1.0, -0.3, 0.0, 0.3, 1.0])
+def test_an_interval_holds_exactly_the_values_that_the_test_does_not_exclude(shift):
+    drawn = np.random.default_rng(3).standard_normal(9) + shift
+    found = Estimate.of(values_of(*drawn))
+    assert found.low is not None
+    assert found.high is not None
+    assert found.low < found.value < found.high
+    for inside in (found.low + 1e-9, found.high - 1e-9):
+        assert Estimate.of(values_of(*(drawn - inside))).p_value > 0.05
+    for outside in (found.low - 1e-9, found.high + 1e-9):
+        assert Estimate.of(values_of(*(drawn - outside))).p_value <= 0.05
+
+
+def test_prompts_without_a_difference_make_nothing_certain():
+    assert Estimate.of(values_of(*[0.0] * 12)).p_value == 1
+    assert Estimate.of(values_of(*[0.0] * 12)).sign_p_value == 1
+    assert Estimate.of(values_of(*[0.0] * 11, 1.0)).p_value == 1
+    five = Estimate.of(values_of(*range(1, 6)))
+    assert (five.low, five.high, five.p_value) == (None, None, pytest.approx(2 / 2**5))
+
+
+def test_the_order_of_cells_does_not_matter():
     values = {cell(prompt, seed): float(ord(prompt) * seed % 7) for prompt in "abcdef" for seed in range(3)}
     assert Estimate.of(values) == Estimate.of(dict(reversed(values.items())))
+
+
+def test_the_correction_of_holm_has_the_values_of_its_definition():
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.9, 0.6]) == [1, 1]
+    assert holm([]) == []
+
+
+def test_every_two_arms_are_compared_and_corrected_as_one_family(jobs):
+    for level in ("none", "strong"):
+        for i in range(8):
+            for arm, gain in (("red", 0.0), ("green", 0.1 * (-1) ** i), ("blue", 5.0)):
+                where = (f"prompt=object {i}", f"noise={level}")
+                jobs.add("cadam", *where, n=100, psnr=20.0 + gain + 0.01 * i, arm=arm)
+    pairs = every_pair(read(jobs.folder))
+    found = [(each.noise, each.comparison.ours.name, each.comparison.theirs.name) for each in pairs]
+    names = [("green", "red"), ("blue", "red"), ("blue", "green")]
+    assert found == [(level, *pair) for level in ("none", "strong") for pair in names]
+    assert [each.is_certain for each in pairs] == [False, True, True] * 2
+    # Four of the six differences have the smallest possible p, so the first is multiplied by 6.
+    assert pairs[1].p_value == pytest.approx(6 * 2 / 2**8)
+    assert could_be_certain(pairs)
+    assert not could_be_certain(pairs * 2)
+
+
+def test_settings_have_the_names_of_the_tables_and_an_arm_means_its_main_setting(jobs):
+    for tau in (0.001, 0.0002):
+        jobs.add("baseline", f"densifier.tau_pos={tau}", n=100, psnr=20.0)
+    jobs.add("cadam", n=100, psnr=20.0)
+    jobs.add("cadam", "seed=1", n=100, psnr=20.0, arm="elsewhere")
+    results = read(jobs.folder)
+    named = named_settings(results, ["baseline (tau_pos 0.001)", "baseline"])
+    assert [each.values for each in named] == ["0.001", "0.0002"]
+    with pytest.raises(UserError, match="expected two of baseline, cadam, elsewhere, baseline "):
+        named_settings(results, ["cadam", "missing"])
+    with pytest.raises(UserError, match="a cell in common"):
+        named_settings(results, ["cadam", "elsewhere"])
 
 
 # Gains and frontiers over cells.
@@ -202,10 +274,8 @@ def test_an_arm_is_represented_by_its_shipped_setting_or_the_one_with_the_middle
     assert main_setting(read(jobs.folder), "baseline").values == "0.0002"
 
 
-def test_arms_are_compared_with_the_first_that_grows_and_with_the_one_that_does_not(jobs):
+def test_the_baseline_is_the_first_arm_that_grows_or_the_one_that_is_named(jobs):
     for arm, densifier in (("zero", "none"), ("first", "cadam"), ("second", "baseline")):
         jobs.add(densifier, n=100, psnr=20.0, arm=arm)
     results = read(jobs.folder)
-    assert references(results) == ["first", "zero"]
-    assert references(results, "second") == ["second", "zero"]
-    assert references(results, "missing") == ["zero"]
+    assert [baseline_of(results, name) for name in (None, "second", "missing")] == ["first", "second", None]

@@ -208,6 +208,25 @@ def test_any_two_arms_are_compared_whatever_their_names(jobs):
     assert pairs == [("red", "blue"), ("green", "blue")]
 
 
+@pytest.mark.parametrize(("prompts", "is_possible"), [(6, False), (7, True)])
+def test_a_page_shows_every_two_arms_and_whether_so_many_can_be_certain(jobs, prompts, is_possible):
+    for i in range(prompts):
+        for arm, psnr in (("red", 20.0), ("green", 20.0), ("my <b>own</b>", 21.5)):
+            jobs.add("cadam", f"prompt=object {i}", n=100, psnr=psnr, arm=arm)
+    text = text_of(html.unescape(report.write_sweep(jobs.folder).read_text(encoding="utf-8")))
+    assert "corrected by Holm's method for all 3 pairs" in text
+    assert ("no difference among so many pairs could be certain" in text) != is_possible
+    difference = "+1.50 [+1.50, +1.50]" + " *" * is_possible
+    assert f"green +0.00 [+0.00, +0.00] - my own {difference} {difference}" in text
+    assert "p corrected" in (jobs.folder / "figures/pairs.csv").read_text()
+
+
+def test_a_page_with_two_arms_has_no_matrix(jobs):
+    for arm in ("red", "green"):
+        jobs.add("cadam", n=100, psnr=20.0, arm=arm)
+    assert "Every two arms" not in report.write_sweep(jobs.folder).read_text(encoding="utf-8")
+
+
 def test_numbers_of_a_metric_from_elsewhere_are_in_the_tables(jobs):
     entry = {"label": "shine", "unit": "lx", "digits": 1, "is_more_better": True, "preference": 1}
     for arm, shine in (("baseline", 2.0), ("cadam", 3.5)):
@@ -217,7 +236,7 @@ def test_numbers_of_a_metric_from_elsewhere_are_in_the_tables(jobs):
         (folder / "summary.json").write_text(json.dumps({**summary, "shine": shine}))
     results = read(jobs.folder)
     [line] = tables.comparison_table(results)
-    assert line["shine (lx)"].median == 1.5
+    assert line["shine (lx)"].value == 1.5
     assert [line["shine (lx)"] for line in tables.medians_table(results)] == [2.0, 3.5]
 
 

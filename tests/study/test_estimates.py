@@ -7,7 +7,6 @@ from scipy.stats import binomtest, t
 
 from cadam3d.study.estimates import (
     Clusters,
-    holm,
     margin,
     rate_interval,
     sign_test,
@@ -110,9 +109,3 @@ def test_the_sign_test_counts_majorities_and_leaves_out_ties():
     chosen, units = np.array([1, 1, 0] * 6 + [1, 0]) > 0, np.array([*np.repeat(range(6), 3), 6, 6])
     assert sign_test(chosen, units) == pytest.approx(2 / 2**6)
     assert sign_test(np.array([True, False]), np.array([0, 0])) == 1
-
-
-def test_the_correction_of_holm_has_the_values_of_its_definition():
-    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert holm([0.9, 0.6]) == [1, 1]
-    assert holm([]) == []
