@@ -30,7 +30,6 @@ from cadam3d.io.reading import read_yaml
 from cadam3d.io.text_tables import write_csv
 from cadam3d.metric.fidelity import Fidelity
 from cadam3d.report.compare import (
-    Estimate,
     above_frontier,
     arms_without_growth,
     by_cell,
@@ -42,6 +41,7 @@ from cadam3d.report.compare import (
     settings_of,
     value_of,
 )
+from cadam3d.report.estimate import Estimate
 from cadam3d.report.figures import frontier_figure
 from cadam3d.report.results import PREFIX, ArmSetting, JobResult, arms_of, read, results_of
 from cadam3d.report.style import styled
