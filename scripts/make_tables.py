@@ -52,6 +52,7 @@ NUMBERS = {each.name: each for each in Fidelity.numbers if each.name.startswith(
 BEFORE = ("prompt", "seed", "arm", "densifier")
 RESULTS = ("outcome", "grows", COUNT.name, "psnr", "ssim", "psnr_turned", "ssim_turned")
 AFTER = (*RESULTS, "seconds", "cpu_seconds", "commit", "machine", "threads")
+TEXTS = ("prompt", "arm", "commit", "machine")  # also those that look like numbers, such as 12345e7
 MARKED = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 MISSING = "*Not measured yet.*"
 
@@ -68,6 +69,7 @@ class Drawing:
     by: Sequence[str] = ()  # columns, such as noise; each combination of their values has its own lines
     arms: Sequence[str] = ()  # arms or settings to show; empty = all settings
     pairs: Sequence[Sequence[str]] = ()  # of arms or settings
+    against: str = ""  # the arm or setting with which others are compared; empty = the arm without growth
     frontier: str = ""  # the arm with whose best setting at equal count settings are compared
     columns: str = ""  # of a pivot table: the column whose values are the titles
     cell: str = ""  # of a pivot table: the format of a cell
@@ -109,7 +111,8 @@ def read_lines(file: Path) -> list[Line]:
     """Return the rows of a file, without empty cells."""
     with file.open(encoding="utf-8", newline="") as opened:
         return [
-            {key: _value(text) for key, text in line.items() if text != ""} for line in csv.DictReader(opened)
+            {key: text if key in TEXTS else _value(text) for key, text in line.items() if text != ""}
+            for line in csv.DictReader(opened)
         ]
 
 
@@ -142,12 +145,12 @@ def with_results(lines: Sequence[Line]) -> list[Line]:
 
 
 def settings_table(drawing: Drawing, lines: Sequence[Line]) -> list[Line]:
-    """Return medians of each setting, its gain over the arm without growth, and that over a frontier."""
+    """Return medians of each setting, its gain over another one, and its gain over a frontier."""
     found = []
     for where, own in groups(lines, drawing.by):
         here = [line["result"] for line in own]
-        quality, still = qualities(here)[0], arms_without_growth(here)
-        zero = main_setting(here, still[0]) if still else None
+        quality, against = qualities(here)[0], drawing.against or next(iter(arms_without_growth(here)), "")
+        zero = _chosen(here, [against])[0] if against else None
         for setting in _chosen(here, drawing.arms):
             members = list(by_cell(here, setting).values())
             early = sum(each.ended_early for each in members)
@@ -244,11 +247,14 @@ def _cpu_seconds(result: JobResult) -> float | None:
 
 
 def _cell(form: str, lines: Sequence[Line]) -> str:
-    """Return a format that is filled with medians of numbers and with the texts of the first row."""
+    """Return a format filled with medians of numbers and texts of the first row; a dash if one is missing."""
     first = lines[0]
     numbers = [key for key, value in first.items() if type(value) in (int, float)]
     medians = {key: median(line[key] for line in lines if key in line) for key in numbers}
-    return form.format(**{**first, **medians})
+    try:
+        return form.format(**{**first, **medians})
+    except KeyError:
+        return "-"
 
 
 def _median(values: Iterable[float | None], digits: int) -> str:

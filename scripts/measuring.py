@@ -176,10 +176,13 @@ def processor() -> str:
 
 
 def commit() -> str | None:
-    """Return the current commit, marked if files differ from it; ``None`` outside a checkout."""
-    found = first_line("git", "-C", str(HERE), "rev-parse", "HEAD")
+    """Return the commit as runs record it: ``fbdfba5``, or ``fbdfba5-dirty`` if files differ from it.
+
+    ``None`` outside a checkout.
+    """
+    found = first_line("git", "-C", str(HERE), "rev-parse", "--short=7", "HEAD")
     changed = first_line("git", "-C", str(HERE), "status", "--porcelain", "--untracked-files=no")
-    return f"{found} with changes" if found and changed else found
+    return f"{found}-dirty" if found and changed else found
 
 
 def first_line(*command: str) -> str | None:

@@ -97,6 +97,10 @@ def test_rows_of_a_sweep_compare_as_the_sweep_does(jobs, tmp_path):
             "| `baseline (tau_pos 0.0002)` | 6 | 2,000 | 26.50 | +4.00 [+4.00, +4.00] | - | 2 |",
         ),
         (
+            {"kind": "settings", "against": "cadam", "arms": ["none"]},
+            "| `none` | 6 | 300 | 22.50 | -5.00 [-5.00, -5.00] | 1 |",
+        ),
+        (
             {"kind": "pairs", "pairs": [["cadam", "baseline"]]},
             "| `cadam` | `baseline (tau_pos 0.0002)` | 6 | -50.0 [-50.0, -50.0] "
             "| +1.00 [+1.00, +1.00] | +1 [+1, +1] |",
@@ -107,7 +111,7 @@ def test_rows_of_a_sweep_compare_as_the_sweep_does(jobs, tmp_path):
         ),
         ({"kind": "rows", "by": ["arm", "prompt"], "where": {"prompt": ["a boat"]}}, "| cadam | a boat |"),
     ],
-    ids=["settings", "frontier", "pairs", "pivot", "rows"],
+    ids=["settings", "frontier", "against", "pairs", "pivot", "rows"],
 )
 def test_a_table_shows_planted_numbers(data, more, line):
     assert line in make_tables.text_of("mine", Drawing(data="mine", **more), data, data / "x.md").splitlines()
