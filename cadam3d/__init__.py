@@ -15,14 +15,14 @@ __version__ = "0.1.0"
 _HOMES = {
     "Asset": "cadam3d.api.asset",
     "Callback": "cadam3d.callback.base",
+    "ResultTable": "cadam3d.api.result_tables",
     "Run": "cadam3d.api.training",
     "Stepper": "cadam3d.api.stepping",
-    "Table": "cadam3d.api.tables",
     "UserError": "cadam3d.core.errors",
     "compose": "cadam3d.api.stepping",
-    "evaluate": "cadam3d.api.tables",
+    "evaluate": "cadam3d.api.result_tables",
     "load": "cadam3d.api.asset",
-    "sweep": "cadam3d.api.tables",
+    "sweep": "cadam3d.api.result_tables",
     "train": "cadam3d.api.training",
 }
 

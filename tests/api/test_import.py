@@ -13,7 +13,7 @@ import cadam3d
 REPOSITORY = Path(__file__).parents[2]
 HEAVY = {"torch", "numpy", "hydra", "omegaconf", "matplotlib", "scipy", "jaxtyping"}
 OPENMP = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
-NAMES = {"Asset", "Callback", "Run", "Stepper", "Table", "UserError"}
+NAMES = {"Asset", "Callback", "ResultTable", "Run", "Stepper", "UserError"}
 NAMES |= {"compose", "evaluate", "load", "sweep", "train"}
 
 

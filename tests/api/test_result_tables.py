@@ -27,7 +27,7 @@ def run_here(_plan, row, _stop, lock) -> int:
 
 
 @pytest.fixture(scope="module")
-def table() -> cadam3d.Table:
+def table() -> cadam3d.ResultTable:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(process, "_wait", run_here)
         return cadam3d.sweep(*LINE, folder="table")
@@ -80,7 +80,7 @@ def test_an_interrupted_sweep_continues_and_the_program_of_the_caller_stays_as_i
         with pytest.raises(KeyboardInterrupt, match=r"cadam3d\.sweep\('hydra.sweep.dir=halt', "):
             cadam3d.sweep(*line, folder="halt")
         assert process_state() == before
-        assert [row["outcome"] for row in cadam3d.Table("halt").rows] == ["interrupted", "unfinished"]
+        assert [row["outcome"] for row in cadam3d.ResultTable("halt").rows] == ["interrupted", "unfinished"]
         monkeypatch.setattr(process, "_wait", run_here)
         table = cadam3d.sweep(*line, folder="halt")
         assert process_state() == before
@@ -101,4 +101,4 @@ def test_what_a_sweep_cannot_do_is_refused(words, message):
     with pytest.raises(cadam3d.UserError, match=message):
         cadam3d.sweep(*words)
     with pytest.raises(cadam3d.UserError, match="run: expected the folder of a run"):
-        cadam3d.Table("nowhere")
+        cadam3d.ResultTable("nowhere")

@@ -19,7 +19,7 @@ from cadam3d.sweep.folder import UNNAMED, Row, is_sweep, load
 from cadam3d.sweep.table import as_text, records_of
 
 
-class Table:
+class ResultTable:
     """The numbers in the folder of a sweep or of a run, as they are in ``sweep.csv``.
 
     They are read from the files when they are asked for. ``pandas.DataFrame(table.rows)`` is a data frame.
@@ -96,10 +96,10 @@ class Table:
         return str(self.folder)
 
     def __repr__(self) -> str:
-        return f"<Table {shown(self.folder)}>\n{as_text(self._jobs)}"
+        return f"<ResultTable {shown(self.folder)}>\n{as_text(self._jobs)}"
 
 
-def sweep(*overrides: str, folder: str | os.PathLike[str] | None = None) -> Table:
+def sweep(*overrides: str, folder: str | os.PathLike[str] | None = None) -> ResultTable:
     """Train many times, and return the table of all jobs.
 
     This is ``cadam3d sweep OVERRIDES``, with the same checks, locks, files and processes: a job runs in a
@@ -122,14 +122,14 @@ def sweep(*overrides: str, folder: str | os.PathLike[str] | None = None) -> Tabl
     if ended.was_stopped:
         again = f"cadam3d.sweep({', '.join(map(repr, words))})"
         raise KeyboardInterrupt(f"Everything is saved. Continue with: {again}")
-    return Table(ended.folder)
+    return ResultTable(ended.folder)
 
 
-def evaluate(run: str | os.PathLike[str], *overrides: str) -> Table:
+def evaluate(run: str | os.PathLike[str], *overrides: str) -> ResultTable:
     """Measure a run, or every job of a sweep, and return the table with the new numbers.
 
     This is ``cadam3d eval run=RUN OVERRIDES``, with the same checks and files. ``run`` is a folder, a
-    :class:`Run` or a :class:`Table`, and ``overrides`` are words such as ``"metric=[clip]"``.
+    :class:`Run` or a :class:`ResultTable`, and ``overrides`` are words such as ``"metric=[clip]"``.
 
     Raises ``UserError`` for mistakes, and if nothing could be measured.
     """
@@ -138,4 +138,4 @@ def evaluate(run: str | os.PathLike[str], *overrides: str) -> Table:
     with as_guest(), completing():
         cfg, call = prepare("eval", [literal("run", place), *overrides])
         evaluation.run(cfg, call)
-    return Table(place)
+    return ResultTable(place)
