@@ -33,6 +33,7 @@ from cadam3d.report.compare import (
     above_frontier,
     arms_without_growth,
     by_cell,
+    clock,
     compare,
     hull_of,
     main_setting,
@@ -166,7 +167,8 @@ def settings_table(drawing: Drawing, lines: Sequence[Line]) -> list[Line]:
                 above = above_frontier(here, setting, drawing.frontier, value_of(quality))
                 gain = Estimate.of(above) if above and setting.arm != drawing.frontier else None
                 line[f"over the frontier of `{drawing.frontier}` (dB)"] = _written(gain, quality.digits)
-            line["CPU seconds"] = _median(map(_cpu_seconds, members), 0)
+            heading, seconds = clock(here)
+            line[heading] = _median(map(seconds, members), 0)
             found.append(line)
     return found
 
@@ -183,7 +185,8 @@ def pairs_table(drawing: Drawing, lines: Sequence[Line]) -> list[Line]:
                 line: Line = {**where, **names, "cells": len(pair.pairs)}
                 line["Gaussians (%)"] = _written(pair.count, 1)
                 line[quality.heading] = _written(pair.difference(value_of(quality)), quality.digits)
-                line["CPU seconds"] = _written(pair.difference(_cpu_seconds), 0)
+                heading, seconds = clock(here)
+                line[heading] = _written(pair.difference(seconds), 0)
                 found.append(line)
     return found
 
@@ -240,10 +243,6 @@ def _chosen(results: Sequence[JobResult], names: Sequence[str]) -> list[ArmSetti
     if wrong := [name for name in names if name not in (*known, *arms_of(results))]:
         raise UserError(f"tables.yaml: expected arms or settings of {', '.join(known)}, got {wrong[0]}")
     return [known.get(name) or main_setting(results, name) for name in names] or list(known.values())
-
-
-def _cpu_seconds(result: JobResult) -> float | None:
-    return result.summary.get("cpu_seconds")
 
 
 def _cell(form: str, lines: Sequence[Line]) -> str:
