@@ -45,34 +45,22 @@ class ResultTable:
         return self.folder / REPORT
 
     def compare(self, ours: str, theirs: str) -> list[dict[str, Any]]:
-        """Return how the arm ``ours`` differs from the arm ``theirs`` of a sweep, paired within cells.
+        """Return how ``ours`` differs from ``theirs``, two arms or settings, paired within cells.
 
         There is one dict per noise level and number: the count in percent, the numbers by which assets are
-        chosen, and the seconds. Each has the median difference, its 95 % interval from ``low`` to ``high``
-        over prompts (None with too few of them), the p-value, and how many cells and prompts it is from. An
-        arm with several thresholds is represented by its shipped or its middle setting, as in the report.
-        Raises ``UserError`` for another arm.
+        chosen, and the seconds. Each has the difference as ``value``, its 95 % interval from ``low`` to
+        ``high`` over prompts (None with too few of them) and the p-values. The name of an arm stands for its
+        main setting, as in the report. Raises ``UserError`` for other names.
         """
-        from cadam3d.report.compare import compare, main_setting, qualities, value_of
-        from cadam3d.report.results import arms_of, at_noise, levels_of, read
+        from cadam3d.report.compare import named_settings
+        from cadam3d.report.results import read
+        from cadam3d.report.tables import two_settings
 
         results = read(self.folder) if is_sweep(self.folder) else []
-        arms = arms_of(results)
-        if not {ours, theirs} <= {*arms}:
-            example = f"table.compare({arms[-1]!r}, {arms[0]!r})" if arms else "the table of a sweep"
-            raise fail("arms", expected=f"two of {', '.join(arms)}", got=(ours, theirs), example=example)
-        lines = []
-        for level in levels_of(results):
-            here = at_noise(results, level)
-            found = compare(here, main_setting(here, ours), main_setting(here, theirs))
-            if found is None:
-                continue
-            estimates = {"Gaussians (%)": found.count}
-            estimates |= {each.heading: found.difference(value_of(each)) for each in qualities(here)}
-            estimates["seconds"] = found.difference(lambda result: result.seconds)
-            known = {name: each for name, each in estimates.items() if each is not None}
-            lines += [{"noise": level, "number": name, **asdict(each)} for name, each in known.items()]
-        return lines
+        with hinting(has_words=False):
+            settings = named_settings(results, [ours, theirs])
+        lines, _ = two_settings(results, *settings)
+        return [asdict(line.pop("difference")) | line for line in lines]
 
     @property
     def _jobs(self) -> Sequence[Row]:
