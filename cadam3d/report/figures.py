@@ -38,7 +38,7 @@ from cadam3d.report.style import Look, label_axis, looks, new_figure
 
 # A dagger: some jobs of the setting ended before their last step.
 EARLY = "\u2020"
-LEGEND_COLUMNS = 4
+LEGEND_WIDTH, LEGEND_LINE = 2.6, 0.19  # inches
 
 
 def frontier_figure(results: Sequence[JobResult], quality: Number | None = None) -> Figure | None:
@@ -74,9 +74,15 @@ def _panels(
     up: str,
     height: float,
 ) -> Figure:
-    """Return a figure in which ``draw`` has filled a panel per noise level with the results of that level."""
+    """Return a figure in which ``draw`` has filled a panel per noise level with the results of that level.
+
+    It has room for a legend on the right.
+    """
     levels = levels_of(results)
-    figure = new_figure(len(levels), height=height)
+    width = min(1.6 + 3.4 * len(levels), 9.4) + LEGEND_WIDTH
+    figure = new_figure(
+        len(levels), width=width, height=max(height, LEGEND_LINE * len(arms_of(results)) + 0.6)
+    )
     panels = figure.subplots(1, len(levels), squeeze=False, sharey=True)[0]
     for axes, level in zip(panels, levels, strict=True):
         draw(axes, at_noise(results, level))
@@ -109,13 +115,12 @@ def _draw_frontier(axes: Axes, points: Sequence[FrontierPoint], look: Look) -> N
 
 
 def _add_legend(figure: Figure, names: dict[str, str], style: dict[str, Look]) -> None:
-    """Write the names of arms below a figure, with their colours and markers."""
+    """Write the names of arms beside a figure, with their colours and markers."""
     handles = [
         Line2D([], [], label=name, color=style[arm].color, marker=style[arm].marker)
         for arm, name in names.items()
     ]
-    columns = min(len(handles), LEGEND_COLUMNS if len(figure.axes) > 1 else 2)
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False, fontsize=8)
+    figure.legend(handles=handles, loc="outside right upper", frameon=False, fontsize=8)
 
 
 def growth_figure(results: Sequence[JobResult]) -> Figure | None:
