@@ -134,7 +134,9 @@ def shown_matrix(pairs: Sequence[CorrectedPair]) -> list[Line]:
     for each in pairs:
         ours, theirs = each.comparison.ours.name, each.comparison.theirs.name
         line = lines.setdefault((each.noise, ours), {"noise": each.noise, "arm": ours})
-        line[f"minus {theirs}"] = each.difference.written(each.number.digits) + " *" * each.is_certain
+        # The interval is below the difference, so that many arms fit on a page.
+        difference, _, interval = each.difference.written(each.number.digits).partition(" ")
+        line[f"minus {theirs}"] = f"{difference}{' *' * each.is_certain}\n{interval}".rstrip()
     return _without_empty(list(lines.values()))
 
 

