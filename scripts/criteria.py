@@ -13,6 +13,7 @@ import csv
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +33,10 @@ from cadam3d.core.gaussians import Gaussians
 from cadam3d.densifier.absgrad import AbsGrad, AbsGradState
 from cadam3d.densifier.base import Densifier, GradientSignal
 from cadam3d.densifier.cadam import CAdam, CAdamState
+from cadam3d.io.text_tables import write_csv
 from cadam3d.optimizer import GaussianOptimizer
-from cadam3d.prior.base import Condition, PromptEmbedding
+from cadam3d.prior.base import Condition
+from cadam3d.report.style import COLORS, styled
 from cadam3d.trainer import Trainer
 
 DATA, FIGURE = HERE / "docs/data/criteria.csv", HERE / "docs/images/criteria.png"
@@ -59,11 +62,18 @@ VIEWS, NOISES = 24, 4  # of which the parts of the variance are estimated
 RESAMPLES = 200
 SH_0 = 0.28209479177387814  # the constant harmonic: colour = 0.5 + SH_0 sh
 TINY = 1e-20
+PARTS = ("drift_part", "view_part", "noise_part", "pixel_part")
+WORTH = ("mdb_noisy", "mdb_exact")  # PSNR per added Gaussian, in thousandths of a dB
 COLUMNS = [
     *("object", "world", "phase", "noise", "criterion", "auc", "low", "high", "auc_seen", "captured"),
-    *("mdb_noisy", "mdb_exact", "pixel_part", "view_part", "noise_part", "drift_part", "gaussians"),
-    *("reliability", "seed", "commit", "machine", "threads", "cpu_seconds"),
+    *(*WORTH, *PARTS, "gaussians", "reliability", "seed", "commit", "machine", "threads", "cpu_seconds"),
 ]
+PANELS = {
+    "auc": "Area under the ROC curve",
+    "captured": "Share of the gain captured",
+    "mdb_noisy": "PSNR per added Gaussian (mdB)",
+}
+Rows = Sequence[Mapping[str, Any]]
 
 
 @dataclass
@@ -134,11 +144,10 @@ class Frozen:
         assert edit is not None
         return edit
 
-    def tune(self, owner: GaussianOptimizer, steps: int, noise_seed: int | None = None) -> Gaussians:
-        """Return the Gaussians after ``steps`` steps towards the truth, or by the objective of the run."""
+    def tune(self, owner: GaussianOptimizer, noise_seed: int | None = None) -> Gaussians:
+        """Return the Gaussians after some steps towards the truth, or by the objective of the run."""
         draws = torch.Generator().manual_seed(noise_seed or 0)
-        for i in range(steps):
-            shot = self.pairs[i % len(self.pairs)]
+        for i, shot in zip(range(STEPS), cycle(self.pairs), strict=False):
             rgb = self.render(owner.gaussians, shot).rgb
             loss = (rgb - shot.truth).square().mean()
             if noise_seed is not None:
@@ -168,9 +177,9 @@ class Frozen:
         return torch.cat(found, dim=1).T
 
 
-def frozen_runs(words: Sequence[str], seed: int = 0) -> Iterator[tuple[str, Frozen]]:
+def frozen_runs(words: Sequence[str]) -> Iterator[tuple[str, Frozen]]:
     """Yield each phase with the run of ``words``, frozen there."""
-    draft = cadam3d.compose(*words, f"seed={seed}", "device=cpu")
+    draft = cadam3d.compose(*words, "seed=0", "device=cpu")
     assert isinstance(draft.parts.densifier, CAdam)
     panel = Panel(cadam=draft.parts.densifier, absgrad=option("densifier", "absgs", AbsGrad))
     stepper = replace(draft, parts=replace(draft.parts, densifier=panel))
@@ -189,21 +198,20 @@ def shots_of(stepper: Stepper) -> tuple[list[Shot], list[Shot], list[Shot]]:
     parts, draws = stepper.parts, torch.Generator().manual_seed(1)
     embedding = parts.prior.embed(stepper.prompt, stepper.negative_prompt)
 
+    def shot(cameras: Cameras, background: Tensor) -> Shot:
+        condition = embedding.at(cameras, background)
+        # Each prompt has a single mode, so that any image is nearest to it.
+        truth = condition.nearest(torch.zeros(len(cameras), cameras.height, cameras.width, 3))
+        assert truth is not None
+        return Shot(cameras, background, condition, truth)
+
     def sample(views: int) -> Shot:
-        cameras = parts.camera.sample(0, views, draws)
-        return shot_of(embedding, cameras, parts.background.sample(views, draws))
+        return shot(parts.camera.sample(0, views, draws), parts.background.sample(views, draws))
 
     pairs, singles = [sample(2) for _ in range(STEPS)], [sample(1) for _ in range(VIEWS)]
     size = pairs[0].cameras.height
     rings = [turntable(8, elevation_deg=e, distance=3.1, fov_y_deg=42.5, size=size) for e in (0.0, 30.0)]
-    return pairs, singles, [shot_of(embedding, ring, torch.ones(8, 3)) for ring in rings]
-
-
-def shot_of(embedding: PromptEmbedding, cameras: Cameras, background: Tensor) -> Shot:
-    condition = embedding.at(cameras, background)
-    truth = condition.nearest(torch.zeros(len(cameras), cameras.height, cameras.width, 3))
-    assert truth is not None
-    return Shot(cameras, background, condition, truth)
+    return pairs, singles, [shot(ring, torch.ones(8, 3)) for ring in rings]
 
 
 # --- the truth --------------------------------------------------------------------------------------------
@@ -222,7 +230,7 @@ def gains(frozen: Frozen, groups: int = GROUPS, partitions: int = PARTITIONS) ->
         maps = []
         for group in range(groups):
             edit = frozen.refined(label == group, seed=partition * groups + group)
-            maps.append(frozen.errors(frozen.tune(adam.start(edit.apply(frozen.gaussians)), STEPS)))
+            maps.append(frozen.errors(frozen.tune(adam.start(edit.apply(frozen.gaussians)))))
         sums = frozen.blended(torch.stack(maps))
         refined = sums.gather(0, label[None])[0]
         found[partition % 2] += (sums.sum(0) - refined) / (groups - 1) - refined
@@ -242,7 +250,7 @@ def noise_free(frozen: Frozen) -> tuple[Tensor, Tensor]:
 
 
 def variance(frozen: Frozen) -> tuple[Tensor, Tensor, Tensor]:
-    """Return |expected gradient|^2 and the variances between views and from noise, for the world position."""
+    """Return the squared expected gradient of the means, and the variances between views and from noise."""
     draws, means = torch.Generator().manual_seed(2), frozen.gaussians.means.clone().requires_grad_()
     samples = []
     for shot in frozen.singles:
@@ -294,12 +302,12 @@ def auc(scores: Tensor, wanted: Tensor) -> float:
     return float((ranks[is_wanted].sum() - count * (count + 1) / 2) / (count * (len(ranks) - count)))
 
 
-def auc_interval(scores: Tensor, wanted: Tensor) -> tuple[float, float]:
-    """Return the 95 % interval of the area, from a bootstrap over Gaussians."""
+def auc_interval(scores: Tensor, wanted: Tensor) -> tuple[float, float, float]:
+    """Return the area and its 95 % interval, from a bootstrap over Gaussians."""
     draws = np.random.default_rng(0)
     rows = [torch.from_numpy(draws.integers(len(scores), size=len(scores))) for _ in range(RESAMPLES)]
     low, high = np.quantile([auc(scores[r], wanted[r]) for r in rows], [0.025, 0.975])
-    return float(low), float(high)
+    return auc(scores, wanted), float(low), float(high)
 
 
 def top(scores: Tensor, share: float) -> Tensor:
@@ -309,144 +317,138 @@ def top(scores: Tensor, share: float) -> Tensor:
     return chosen
 
 
-def psnr_after(frozen: Frozen, selected: Tensor, is_noisy: bool) -> tuple[float, int]:
+def psnr_after(frozen: Frozen, selected: Tensor, worth: str) -> tuple[float, int]:
     """Return the PSNR after refining ``selected`` and some more steps, and the count.
 
-    Noisy steps are those of the run, with its moments of Adam. Others are those of the trials.
+    ``mdb_noisy`` has steps of the run, with its moments of Adam, and ``mdb_exact`` those of the trials.
     """
+    is_noisy = worth == "mdb_noisy"
     edit, owner = frozen.refined(selected, seed=4), frozen.parts.optimizer.start(frozen.gaussians)
     owner.load_state_dict(frozen.adam)
     owner.apply(edit)
     if not is_noisy:
         owner = frozen.parts.optimizer.start(owner.gaussians)
-    errors = frozen.errors(frozen.tune(owner, STEPS, noise_seed=4 if is_noisy else None))
+    errors = frozen.errors(frozen.tune(owner, noise_seed=4 if is_noisy else None))
     return float(-10 * (errors.mean((1, 2)) / 3).log10().mean()), edit.rows_after
 
 
 def rows_of(frozen: Frozen) -> Iterator[dict[str, Any]]:
-    """Yield one row per criterion."""
+    """Yield one row per criterion; the last one is the gain itself, which finds itself without error."""
     even, odd = gains(frozen)
-    gain = (even + odd) / 2
-    drift, between, noise = variance(frozen)
-    plain, absolute = noise_free(frozen)
-    found = criteria(frozen, drift, absolute)
+    gain, variances, (plain, absolute) = (even + odd) / 2, variance(frozen), noise_free(frozen)
+    found = criteria(frozen, variances[0], absolute)
     seen = top(found["footprint"], 0.5)
-    total = (drift + between + noise)[seen]
-    parts = {"drift_part": drift[seen] / total, "view_part": between[seen] / total}
-    parts |= {"noise_part": noise[seen] / total, "pixel_part": (1 - plain / absolute.clamp_min(TINY))[seen]}
-    of_state = {name: float(part.median()) for name, part in parts.items()}
-    of_state |= {"gaussians": len(gain), "reliability": float(np.corrcoef(even, odd)[0, 1])}
+    parts = [*(each / sum(variances) for each in variances), 1 - plain / absolute.clamp_min(TINY)]
+    facts = dict(zip(PARTS, (float(part[seen].median()) for part in parts), strict=True))
+    facts |= {"gaussians": len(gain), "reliability": float(np.corrcoef(even, odd)[0, 1])}
     best = float(odd[top(even, CHOSEN)].sum() + even[top(odd, CHOSEN)].sum()) / 2
-    nothing = torch.zeros_like(seen)
-    controls = {
-        "mdb_noisy": psnr_after(frozen, nothing, True),
-        "mdb_exact": psnr_after(frozen, nothing, False),
-    }
+    without = {column: psnr_after(frozen, torch.zeros_like(seen), column) for column in WORTH}
     for name, scores in (found | {"gain": gain}).items():
-        chosen, wanted = top(scores, CHOSEN), top(gain, SHARE)
-        # The gain finds itself without error, which says nothing.
-        row = {} if name == "gain" else dict(zip(("low", "high"), auc_interval(scores, wanted), strict=True))
+        row, chosen = {"criterion": name, **facts}, top(scores, CHOSEN)
         if name != "gain":
-            row |= {"auc": auc(scores, wanted), "auc_seen": auc(scores[seen], top(gain[seen], SHARE))}
             row["captured"] = float(gain[chosen].sum()) / best
-        for column, (before, count) in controls.items():
-            after, grown = psnr_after(frozen, chosen, column == "mdb_noisy")
+            row["auc_seen"] = auc(scores[seen], top(gain[seen], SHARE))
+            row |= zip(("auc", "low", "high"), auc_interval(scores, top(gain, SHARE)), strict=True)
+        for column, (before, count) in without.items():
+            after, grown = psnr_after(frozen, chosen, column)
             row[column] = 1000 * (after - before) / max(grown - count, 1)
-        yield {"criterion": name} | row | of_state
+        yield row
 
 
-# --- the table and the figure -----------------------------------------------------------------------------
+# --- the rows, their table and their figure ---------------------------------------------------------------
 
 
-def collect(path: Path, only: str) -> None:
-    """Add the rows that the file lacks, of objects whose name contains ``only``."""
-    done = {(row["object"], row["noise"], row["phase"]) for row in read(path)}
-    first, others = list(OBJECTS)[:4], list(OBJECTS)[4:]
-    for names, noise in ((names, noise) for names in (first, others) for noise in NOISE):
-        for name in (name for name in names if only in name):
-            if all((name, noise, phase) in done for phase in PHASES):
-                continue
+def collect(path: Path) -> None:
+    """Add the rows that the file lacks, first those of four objects."""
+    rows = read(path)
+    done = {(row["object"], row["noise"], row["phase"]) for row in rows}
+    names = list(OBJECTS)
+    runs = [(name, noise) for some in (names[:4], names[4:]) for noise in NOISE for name in some]
+    for name, noise in runs:
+        words, began = [*OBJECTS[name], f"noise={noise}", f"prompt={name}"], time.process_time()
+        if {(name, noise, phase) for phase in PHASES} <= done:
+            continue
+        for phase, frozen in frozen_runs(words):
+            world = "shapes" if OBJECTS[name] is BENCH else "objects"
+            facts = {"object": name, "world": world, "phase": phase, "noise": noise, "seed": 0}
+            facts |= {"commit": str(commit())[:7], "machine": processor(), "threads": torch.get_num_threads()}
+            added = [facts | row for row in rows_of(frozen)] if (name, noise, phase) not in done else []
+            rows += [row | {"cpu_seconds": round(time.process_time() - began)} for row in added]
+            write_csv(path, [COLUMNS, *([shown(row.get(key, "")) for key in COLUMNS] for row in rows)])
             began = time.process_time()
-            for phase, frozen in frozen_runs([*OBJECTS[name], f"noise={noise}", f"prompt={name}"]):
-                if (name, noise, phase) in done:
-                    continue
-                facts = {"object": name, "world": "shapes" if OBJECTS[name] is BENCH else "objects"}
-                facts |= {"phase": phase, "noise": noise, "seed": 0, "commit": (commit() or "")[:7]}
-                facts |= {"machine": processor(), "threads": torch.get_num_threads()}
-                rows = [facts | row for row in rows_of(frozen)]
-                append(path, [row | {"cpu_seconds": time.process_time() - began} for row in rows])
-                began = time.process_time()
 
 
-def read(path: Path) -> list[dict[str, str]]:
-    if not path.exists():
-        return []
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+def read(path: Path) -> list[dict[str, Any]]:
+    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines())) if path.exists() else []
 
 
-def append(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        if file.tell() == 0:
-            writer.writeheader()
-        writer.writerows(
-            {k: f"{v:.4f}" if isinstance(v, float) else v for k, v in row.items()} for row in rows
-        )
+def shown(value: Any) -> str:
+    return f"{value:.4f}" if isinstance(value, float) else str(value)
 
 
-def pooled(rows: Sequence[Mapping[str, str]], column: str) -> tuple[float, float, float]:
-    """Return the mean over objects and its 95 % interval, from a bootstrap that draws objects."""
+def pooled(rows: Rows, column: str, **where: str) -> tuple[float, float, float] | None:
+    """Return the mean over objects and its 95 % interval, from a bootstrap of objects; None without rows."""
     by_object: dict[str, list[float]] = {}
     for row in rows:
-        by_object.setdefault(row["object"], []).append(float(row[column] or "nan"))
+        if row[column] != "" and all(row[key] == value for key, value in where.items()):
+            by_object.setdefault(row["object"], []).append(float(row[column]))
+    if not by_object:
+        return None
     means = np.array([np.mean(values) for values in by_object.values()])
     draws = np.random.default_rng(0).choice(means, (2000, len(means))).mean(1)
-    return float(means.mean()), *map(float, np.quantile(draws, [0.025, 0.975]))
+    low, high = np.quantile(draws, [0.025, 0.975])
+    return float(means.mean()), float(low), float(high)
 
 
-def print_table(rows: Sequence[Mapping[str, str]]) -> None:
-    """Print the means of every criterion, in Markdown."""
-    columns = ("auc", "auc_seen", "captured", "mdb_noisy", "mdb_exact")
-    print(header(["criterion", *(f"{phase}: {column}" for phase in PHASES for column in columns)]))
-    for name in dict.fromkeys(row["criterion"] for row in rows):
-        cells = []
-        for phase in PHASES:
-            of_phase = [row for row in rows if row["criterion"] == name and row["phase"] == phase]
-            cells += ["{:.2f} ({:.2f}, {:.2f})".format(*pooled(of_phase, column)) for column in columns]
-        print(line_of([name, *cells]))
+def print_tables(rows: Rows) -> None:
+    """Print the means of every criterion over objects and noise in Markdown, a table per phase."""
+
+    def state(row: Mapping[str, Any]) -> tuple[str, ...]:
+        return row["object"], row["noise"], row["phase"]
+
+    drift = {state(row): float(row["mdb_noisy"]) for row in rows if row["criterion"] == "drift"}
+    rows = [{**row, "over drift": float(row["mdb_noisy"]) - drift[state(row)]} for row in rows]
+    columns = ("auc", "auc_seen", "captured", *WORTH, "over drift")
+    for phase in PHASES:
+        print(f"\n{phase}\n\n{header(['criterion', *columns])}")
+        for name in dict.fromkeys(row["criterion"] for row in rows):
+            found = [pooled(rows, column, phase=phase, criterion=name) for column in columns]
+            print(
+                line_of(
+                    [
+                        name,
+                        *("-" if each is None else "{:.2f} ({:.2f}, {:.2f})".format(*each) for each in found),
+                    ]
+                )
+            )
 
 
-def draw(rows: Sequence[Mapping[str, str]], path: Path) -> None:
-    """Draw the area under the curve of every criterion, per phase, noise and world."""
-    from cadam3d.report.style import COLORS, styled
-
-    names = [name for name in dict.fromkeys(row["criterion"] for row in rows) if name != "gain"]
-    with styled({}):
-        figure = Figure(figsize=(9, 4.6), layout="constrained")
-        for axes, phase in zip(figure.subplots(1, 2, sharey=True), PHASES, strict=True):
-            for color, noise in zip(COLORS, ("weak", "medium", "strong"), strict=False):
-                for world, marker in (("shapes", "o"), ("objects", "s")):
-                    here = [r for r in rows if (r["phase"], r["noise"], r["world"]) == (phase, noise, world)]
-                    means = [pooled([r for r in here if r["criterion"] == n], "auc")[0] for n in names]
-                    axes.plot(means, names, marker, color=color, ms=5, label=f"{world}, {noise} noise")
-            axes.axvline(0.5, lw=0.8, color="grey")
-            axes.set(title=f"{phase} (step {PHASES[phase] + 1} of 600)", xlabel="area under the ROC curve")
+def draw(rows: Rows, path: Path) -> None:
+    """Draw the area under the curve and the worth of every criterion, with intervals over objects."""
+    names = list(dict.fromkeys(row["criterion"] for row in rows))
+    with styled():
+        figure = Figure(figsize=(10, 4.8), layout="constrained")
+        for axes, (column, title) in zip(figure.subplots(1, 3, sharey=True), PANELS.items(), strict=True):
+            for offset, (phase, color) in enumerate(zip(PHASES, COLORS, strict=False)):
+                for row, name in enumerate(names):
+                    mean, *ends = pooled(rows, column, phase=phase, criterion=name) or [np.nan] * 3
+                    place, label = row + 0.3 * offset, f"step {PHASES[phase]}" if row == 0 else None
+                    axes.plot(mean, place, "o", color=color, ms=4, label=label)
+                    axes.plot(ends, [place, place], color=color, lw=1.5)
+            axes.set_title(title)
+        axes.set_yticks(range(len(names)), names)
         axes.invert_yaxis()
-        axes.legend(fontsize=7)
+        axes.legend()
         figure.savefig(path, dpi=110)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--only", default="", help="objects whose name contains this")
-    parser.add_argument("--data", type=Path, default=DATA)
-    words = parser.parse_args()
-    collect(words.data, words.only)
-    rows = read(words.data)
-    print_table(rows)
-    draw(rows, FIGURE)
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
+    collect(DATA)
+    print_tables(read(DATA))
+    draw(read(DATA), FIGURE)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ The first line writes a row for each finished job. The second line writes every 
 
 import csv
 import json
-import math
 import os
 import re
 import sys
@@ -205,12 +204,15 @@ def pivot_table(drawing: Drawing, lines: Sequence[Line]) -> list[Line]:
 
 
 def _with_above(lines: Sequence[Line], strategy: str) -> Iterator[Line]:
-    """Yield rows of fits with ``above``, the dB above the best settings of a strategy at equal count."""
+    """Yield rows of fits with ``above``, the dB above the best settings of a strategy at equal count.
+
+    It is "outside" for a count that no setting of the strategy has below or above it.
+    """
     for _, own in groups(lines, ["object", "seed"]):
         hull = hull_of((line["count"], line["psnr"]) for line in own if line["strategy"] == strategy)
         for line in own:
             best = quality_at(hull, line["count"])
-            yield {**line, "above": math.nan if best is None else line["psnr"] - best}
+            yield {**line, "above": "outside" if best is None else f"{line['psnr'] - best:+.2f}"}
 
 
 def rows_table(drawing: Drawing, lines: Sequence[Line]) -> list[Line]:

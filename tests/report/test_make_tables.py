@@ -149,7 +149,7 @@ def test_fits_are_compared_with_the_best_settings_of_a_strategy_at_equal_count()
         for name, own in places.items()
         for i, (count, psnr) in enumerate(own)
     ]
-    columns = {"by": ["strategy", "settings"], "columns": "object", "cell": "{above:+.1f}"}
+    columns = {"by": ["strategy", "settings"], "columns": "object", "cell": "{above}"}
     table = make_tables.pivot_table(Drawing(data="fits", kind="pivot", frontier="default", **columns), lines)
     # The middle setting is below the line between the others, and nothing is extrapolated.
-    assert [line["horse"] for line in table] == ["+0.0", "-1.0", "+0.0", "+0.5", "+nan"]
+    assert [line["horse"] for line in table] == ["+0.00", "-1.00", "+0.00", "+0.50", "outside"]
