@@ -77,6 +77,8 @@ class Library:
         """Return the names of the options of each group, without the groups of Hydra itself."""
         files = [path.relative_to(folder) for folder in self.folders for path in folder.glob("*/**/*.yaml")]
         groups = {path.parent.as_posix() for path in files if path.parts[0] != "hydra"}
+        # What options build on is in groups whose names begin with an underscore. They are not for choosing.
+        groups = {group for group in groups if "/_" not in group}
         return {group: option_names(group, self.folders) for group in sorted(groups)}
 
     def summary(self, group: str, name: str) -> str:

@@ -20,7 +20,8 @@ from cadam3d.settings.options import (
 OPTIONS = sorted(
     (path.parent.relative_to(config_dir()).as_posix(), path.stem)
     for path in config_dir().glob("*/**/*.yaml")
-    if path.parent.name not in ("hydra", "launcher", "grid", "for", "experiment", "noise", "vram")
+    if path.parent.name
+    not in ("hydra", "launcher", "grid", "for", "experiment", "noise", "vram", "_simplify")
 )
 
 
