@@ -371,7 +371,7 @@ def collect(path: Path) -> None:
         for phase, frozen in frozen_runs(words):
             world = "shapes" if OBJECTS[name] is BENCH else "objects"
             facts = {"object": name, "world": world, "phase": phase, "noise": noise, "seed": 0}
-            facts |= {"commit": str(commit())[:7], "machine": processor(), "threads": torch.get_num_threads()}
+            facts |= {"commit": commit(), "machine": processor(), "threads": torch.get_num_threads()}
             added = [facts | row for row in rows_of(frozen)] if (name, noise, phase) not in done else []
             rows += [row | {"cpu_seconds": round(time.process_time() - began)} for row in added]
             write_csv(path, [COLUMNS, *([shown(row.get(key, "")) for key in COLUMNS] for row in rows)])

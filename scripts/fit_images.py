@@ -204,7 +204,7 @@ def fill(path: Path, args: argparse.Namespace) -> None:
     """Append the rows of the table that the file at ``path`` lacks."""
     rows = list(csv.DictReader(path.open(encoding="utf-8"))) if path.is_file() else []
     done = {(row["object"], f"{row['strategy']} {row['settings']}".strip(), int(row["seed"])) for row in rows}
-    where = {"commit": str(commit())[:7], "machine": processor(), "threads": torch.get_num_threads()}
+    where = {"commit": commit(), "machine": processor(), "threads": torch.get_num_threads()}
     photos = {name: photograph(name, args.views, args.width).split() for name in OBJECTS}
     for seed, name, arm in itertools.product(SEEDS, OBJECTS, ARMS):
         if (name, arm, seed) not in done:
