@@ -198,7 +198,7 @@ def could_be_certain(pairs: Sequence[CorrectedPair]) -> bool:
 
 
 def clock(results: Iterable[JobResult]) -> tuple[str, Value]:
-    """Return the heading and the value of the time of training: seconds of CPU if all jobs have them."""
+    """Return the heading and the value of the training time: CPU seconds if all jobs have them."""
     has_cpu = all("cpu_seconds" in result.summary for result in measured(results))
     key, heading = ("cpu_seconds", "CPU seconds") if has_cpu else ("seconds", "seconds")
     return heading, lambda result: number(result.summary.get(key))
